@@ -1,0 +1,66 @@
+"""What every learning algorithm is: a pair of pure functions over one agent, and a policy made from its weights."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from flax import struct
+
+from uavmec_jax.world.environment import Scenario
+from uavmec_jax.world.rollout import Policy
+
+AGENTS_AXIS = "agents"
+"""Name of the ``vmap`` axis of the population; ``update`` runs under it."""
+
+
+@struct.dataclass
+class Agent:
+    """One learning problem: constant while training. Batched by ``vmap``.
+
+    Attributes:
+        key: the agent's own randomness, from its identity, never from its place in a batch.
+        scenario: what it plays.
+        hyper: how it learns; the algorithm's pytree of traced hyperparameters.
+    """
+
+    key: Any
+    scenario: Scenario
+    hyper: Any
+
+
+class LearnerState(Protocol):
+    """The part of an algorithm's state that the population looks at (leaves ``[B, ...]``)."""
+
+    weights: Any
+    diverged_at: Any
+    episode_slots: Any
+    episodes: Any
+
+
+@dataclass(frozen=True)
+class Algorithm:
+    """An algorithm with its static settings bound.
+
+    Attributes:
+        name: as in study files.
+        iterations: length of a training, in iterations.
+        steps_per_iteration: environment steps of one agent in one iteration.
+        agent_bytes: memory of one agent in training.
+        init: ``(agent) -> state``.
+        update: ``(agent, state, first, last) -> state``: the iterations ``first <= i < last``; the two bounds are
+            shared by all agents and never batched. Runs under ``vmap(axis_name=AGENTS_AXIS)``.
+        policy: ``(hyper, weights) -> policy``.
+    """
+
+    name: str
+    iterations: int
+    steps_per_iteration: int
+    agent_bytes: int
+    init: Callable[[Agent], Any]
+    update: Callable[[Agent, Any, Any, Any], Any]
+    policy: Callable[[Any, Any], Policy]
+
+    @property
+    def total_steps(self) -> int:
+        """Environment steps of one agent in a whole training."""
+        return self.iterations * self.steps_per_iteration

@@ -1,0 +1,282 @@
+"""Deep Q-learning as the paper ran it (Stable-Baselines3's DQN with Table 4): one agent, two pure functions.
+
+``init`` makes an agent's state, ``update`` advances it by a stretch of iterations; one iteration is ``train_frequency``
+environment steps and one gradient step. The population (:mod:`uavmec_jax.learning.population`) adds the agent axis with
+``vmap``: the iteration number is shared by all agents and never batched, everything of one agent is.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jaxtyping import Array, Float, Int, UInt
+
+from uavmec_jax.learning import replay
+from uavmec_jax.learning.algorithm import AGENTS_AXIS, Agent, Algorithm
+from uavmec_jax.learning.networks import QNetwork
+from uavmec_jax.learning.optimizers import MAX_LEARNING_RATE, clipped_adam, global_norm
+from uavmec_jax.world.environment import advance, draw_volumes, is_truncated, observe
+from uavmec_jax.world.layout import Layout
+from uavmec_jax.world.params import Params
+from uavmec_jax.world.physics import Cause, State, initial_state
+from uavmec_jax.world.rollout import Policy
+
+
+_WEIGHTS_STREAM = 2**32 - 1
+"""``fold_in`` number of the initial weights; the iterations use their own numbers, from 0."""
+
+
+@struct.dataclass
+class DQNHyper:
+    """Hyperparameters that may differ between agents of one program (traced). Defaults: Table 4 and the library's."""
+
+    learning_rate: Any = struct.field(default=0.0071, metadata={"gt": 0})
+    gamma: Any = struct.field(default=0.98, metadata={"ge": 0, "le": 1})
+    exploration_initial_eps: Any = struct.field(default=1.0, metadata={"ge": 0, "le": 1})
+    exploration_final_eps: Any = struct.field(default=0.05, metadata={"ge": 0, "le": 1})
+    exploration_fraction: Any = struct.field(default=0.35, metadata={"gt": 0, "le": 1})
+    """Share of all steps over which epsilon falls linearly."""
+    target_interval: Any = struct.field(default=10_000, metadata={"ge": 1})
+    """Environment steps of one agent between copies of the target network."""
+    learning_starts: Any = struct.field(default=100, metadata={"ge": 0})
+    """Environment steps of one agent with random actions and without gradient steps."""
+    max_grad_norm: Any = struct.field(default=10.0, metadata={"gt": 0})
+    age_scale: Any = struct.field(default=1.0, metadata={"gt": 0})
+    """Factor on the ages as the network sees them; 1 in the paper."""
+
+
+@dataclass(frozen=True)
+class DQNSpec:
+    """What shapes the program (static)."""
+
+    total_steps: int = 1_000_000
+    """Environment steps of one agent; rounded up to whole iterations."""
+    hidden: tuple[int, ...] = (64, 64)
+    batch_size: int = 16
+    train_frequency: int = 4
+    """Environment steps per gradient step."""
+    replay_capacity: int = 1_000_000
+    n_devices: int = 12
+    max_age: int = 11
+
+    @property
+    def iterations(self) -> int:
+        """Iterations of a whole training."""
+        return -(-self.total_steps // self.train_frequency)
+
+    @property
+    def network(self) -> QNetwork:
+        """The Q-network."""
+        return QNetwork(n_actions=self.n_devices, hidden=self.hidden)
+
+    @property
+    def replay(self) -> replay.ReplaySpec:
+        """The memory. One that is never overrun needs no more room than there are steps."""
+        steps = self.iterations * self.train_frequency
+        return replay.ReplaySpec(
+            n_devices=self.n_devices,
+            capacity=min(self.replay_capacity, steps),
+            stride=self.train_frequency,
+            max_age=self.max_age,
+            wraps=self.replay_capacity < steps,
+        )
+
+    @property
+    def agent_bytes(self) -> int:
+        """Memory of one agent in training, bytes: replay, weights, target, moments, gradient, best weights."""
+        widths = (2 * self.n_devices, *self.hidden, self.n_devices)
+        weights = sum((i + 1) * o for i, o in zip(widths, widths[1:], strict=False))
+        return self.replay.bytes + 6 * 4 * weights
+
+
+@struct.dataclass
+class DQNState:
+    """Everything that changes while one agent trains.
+
+    Attributes:
+        weights: of the Q-network.
+        target: of the target network.
+        moments: Adam's, ``optax.ScaleByAdamState``.
+        world: state of the environment.
+        rows: replay memory, ``[rows, words]`` uint32.
+        diverged_at: int32, environment step at which the agent was frozen, -1 while it is sound.
+        episode_slots: int32, total length of the episodes that ended in this call of ``update``.
+        episodes: int32, how many those were.
+        loss: f32, last loss.
+    """
+
+    weights: Any
+    target: Any
+    moments: Any
+    world: State
+    rows: Any
+    diverged_at: Any
+    episode_slots: Any
+    episodes: Any
+    loss: Any
+
+
+def algorithm(spec: DQNSpec) -> Algorithm:
+    """Bind the static settings."""
+    return Algorithm(
+        name="dqn",
+        iterations=spec.iterations,
+        steps_per_iteration=spec.train_frequency,
+        agent_bytes=spec.agent_bytes,
+        init=partial(init, spec),
+        update=partial(update, spec),
+        policy=partial(policy, spec),
+    )
+
+
+def init(spec: DQNSpec, agent: Agent) -> DQNState:
+    """A fresh agent: random weights, target equal to them, empty memory, a new episode."""
+    observation = jnp.zeros((1, 2 * spec.n_devices))
+    weights = spec.network.init(jax.random.fold_in(agent.key, _WEIGHTS_STREAM), observation)
+    return DQNState(
+        weights=weights,
+        target=jax.tree.map(jnp.copy, weights),
+        moments=clipped_adam().init(weights),
+        world=initial_state(agent.scenario.params, agent.scenario.layout),
+        rows=replay.init(spec.replay),
+        diverged_at=jnp.int32(-1),
+        episode_slots=jnp.int32(0),
+        episodes=jnp.int32(0),
+        loss=jnp.float32(0),
+    )
+
+
+def update(spec: DQNSpec, agent: Agent, state: DQNState, first: Any, last: Any) -> DQNState:
+    """Advance one agent by the iterations ``first <= i < last`` (shared scalars, traced); run under ``vmap``."""
+    state = state.replace(episode_slots=jnp.int32(0), episodes=jnp.int32(0))
+    return jax.lax.fori_loop(first, last, lambda i, carry: _iteration(spec, agent, carry, i), state)
+
+
+def epsilon(hyper: DQNHyper, total_steps: int, steps_done: Any) -> Float[Array, ""]:
+    """Exploration rate when ``steps_done`` environment steps have been made: linear, then constant."""
+    progress = jnp.asarray(steps_done, jnp.float32) / total_steps
+    done = jnp.minimum(progress / hyper.exploration_fraction, 1.0)
+    return hyper.exploration_initial_eps + done * (hyper.exploration_final_eps - hyper.exploration_initial_eps)
+
+
+def gradient_steps(spec: DQNSpec, hyper: DQNHyper, steps_done: Any) -> Int[Array, ""]:
+    """Gradient steps made once the iteration that ends at ``steps_done`` is through; 0 during the warm-up.
+
+    The first falls at the first whole iteration that ends after ``learning_starts`` steps (step 104 in the paper).
+    """
+    return jnp.maximum(steps_done // spec.train_frequency - hyper.learning_starts // spec.train_frequency, 0)
+
+
+def target_is_due(spec: DQNSpec, hyper: DQNHyper, steps_done: Any) -> Array:
+    """Whether a multiple of the target interval lies in the iteration that ends at ``steps_done``."""
+    return steps_done // hyper.target_interval > (steps_done - spec.train_frequency) // hyper.target_interval
+
+
+def q_values(spec: DQNSpec, hyper: DQNHyper, weights: Any, observation: Float[Array, "*b two_n"]) -> Array:
+    """Q-values ``[..., n]``; the ages are scaled as the agent's hyperparameters say."""
+    n = spec.n_devices
+    scale = jnp.where(jnp.arange(2 * n) < n, 1.0, hyper.age_scale)
+    return spec.network.apply(weights, observation * scale)
+
+
+def policy(spec: DQNSpec, hyper: DQNHyper, weights: Any) -> Policy:
+    """The greedy policy of an agent: the action of the highest Q-value; ties go to the lowest number."""
+
+    def act(params: Params, layout: Layout, state: State, key: Any = None) -> Array:
+        return jnp.argmax(q_values(spec, hyper, weights, observe(layout, state))).astype(jnp.int32)
+
+    return act
+
+
+def td_loss(spec: DQNSpec, hyper: DQNHyper, weights: Any, target: Any, batch: replay.Transition) -> Float[Array, ""]:
+    """Smooth-L1 loss of a minibatch ``[B]`` against the one-step target (paper, equations 2 and 3)."""
+    best_next = jnp.max(q_values(spec, hyper, target, batch.next_observation), axis=-1)
+    goal = batch.reward + (1.0 - batch.terminated) * hyper.gamma * best_next
+    chosen = jax.nn.one_hot(batch.action, spec.n_devices)
+    value = jnp.sum(q_values(spec, hyper, weights, batch.observation) * chosen, axis=-1)
+    return jnp.mean(optax.huber_loss(value, goal))
+
+
+def _iteration(spec: DQNSpec, agent: Agent, state: DQNState, i: Int[Array, ""]) -> DQNState:
+    """``train_frequency`` environment steps, the target copy if it is due, one gradient step.
+
+    All randomness of the iteration is one draw: per environment step a volume for each device, whether to explore and
+    where to; then one word for each sample.
+    """
+    steps_done = i * spec.train_frequency
+    per_step = spec.n_devices + 2
+    n_acting = spec.train_frequency * per_step
+    bits = jax.random.bits(jax.random.fold_in(agent.key, i), (n_acting + spec.batch_size,))
+    uniform = (bits[:n_acting] >> 8).astype(jnp.float32).reshape(spec.train_frequency, per_step) * 2.0**-24
+    new_rows = []
+    for j in range(spec.train_frequency):
+        state, row = _act(spec, agent, state, steps_done + j, uniform[j])
+        new_rows.append(row)
+    rows = replay.add(spec.replay, state.rows, steps_done, jnp.stack(new_rows))
+    steps_done += spec.train_frequency
+
+    due = target_is_due(spec, agent.hyper, steps_done)
+    target = jax.lax.cond(  # a true branch: the predicate is the same for all agents
+        jax.lax.pmax(due, AGENTS_AXIS),
+        lambda: jax.tree.map(lambda new, old: jnp.where(due, new, old), state.weights, state.target),
+        lambda: state.target,
+    )
+    batch = replay.sample(spec.replay, rows, steps_done, bits[n_acting:])
+    return _learn(spec, agent.hyper, state.replace(rows=rows, target=target), batch, steps_done)
+
+
+def _act(
+    spec: DQNSpec, agent: Agent, state: DQNState, steps_done: Any, uniform: Float[Array, " n_plus_2"]
+) -> tuple[DQNState, UInt[Array, " words"]]:
+    """One epsilon-greedy environment step and the row to remember it by."""
+    n = spec.n_devices
+    scenario, layout = agent.scenario, agent.scenario.layout
+    greedy = policy(spec, agent.hyper, state.weights)(scenario.params, layout, state.world)
+    anywhere = jnp.minimum((uniform[n + 1] * n).astype(jnp.int32), n - 1)
+    warm_up = steps_done < agent.hyper.learning_starts
+    explore = warm_up | (uniform[n] < epsilon(agent.hyper, spec.total_steps, steps_done))
+    action = jnp.where(explore, anywhere, greedy)
+
+    after, reward, outcome = advance(scenario, state.world, action, draw_volumes(scenario.params, uniform[:n]))
+    terminated = outcome.cause != Cause.NONE
+    ended = terminated | is_truncated(scenario, after, outcome)
+    row = replay.pack(spec.replay, action, reward, after.battery / layout.capacity, after.age, terminated, ended)
+    fresh = initial_state(scenario.params, layout)
+    state = state.replace(
+        world=jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, after),
+        episode_slots=state.episode_slots + jnp.where(ended, after.slot, 0),
+        episodes=state.episodes + ended,
+    )
+    return state, row
+
+
+def _learn(spec: DQNSpec, hyper: DQNHyper, state: DQNState, batch: replay.Transition, steps_done: Any) -> DQNState:
+    """One gradient step, unless the agent is still warming up or has diverged.
+
+    A loss or gradient that is not finite, or a learning rate beyond :data:`MAX_LEARNING_RATE`, freezes the agent with
+    the finite weights it has; see there why nothing else needs to be looked at.
+    """
+    loss, gradient = jax.value_and_grad(lambda w: td_loss(spec, hyper, w, state.target, batch))(state.weights)
+    norm = global_norm(gradient)
+    learning = steps_done > hyper.learning_starts
+    sound = jnp.isfinite(loss) & jnp.isfinite(norm) & (jnp.abs(hyper.learning_rate) <= MAX_LEARNING_RATE)
+    frozen = (state.diverged_at >= 0) | (learning & ~sound)
+    steps, moments = clipped_adam().update(
+        gradient,
+        state.moments,
+        learning_rate=hyper.learning_rate,
+        max_norm=hyper.max_grad_norm,
+        norm=norm,
+        count=gradient_steps(spec, hyper, steps_done),
+        enabled=learning & ~frozen,
+    )
+    return state.replace(
+        weights=optax.apply_updates(state.weights, steps),
+        moments=moments,
+        loss=loss,
+        diverged_at=jnp.where(frozen & (state.diverged_at < 0), steps_done, state.diverged_at),
+    )

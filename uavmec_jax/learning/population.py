@@ -1,0 +1,293 @@
+"""Many agents in lockstep: the agent axis, the devices, and a host loop over jitted, donated chunks.
+
+The population is cut into equal blocks that train one after the other. A block is small enough for the machine: for
+its memory (the replay is what costs) and, on a CPU, for its caches. Within a block the agent axis is split over the
+local devices, and every device runs the same program without talking to the others.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import PRNGKeyArray
+
+from uavmec_jax.learning.algorithm import AGENTS_AXIS, Agent, Algorithm
+from uavmec_jax.world.rollout import rollouts
+
+AGENTS_PER_CORE = 40
+"""Largest block per CPU core: beyond it, weights and Adam's moments leave the core's cache."""
+
+AGENTS_PER_ACCELERATOR = 8192
+"""Largest block per accelerator; memory is usually the tighter bound."""
+
+
+class PopulationTooLargeError(ValueError):
+    """Not even the smallest block of the population fits in memory."""
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """How a population is cut: ``count`` blocks of ``size`` agents on ``devices`` devices, ``bytes`` for each block."""
+
+    count: int
+    size: int
+    devices: int
+    bytes: int
+
+
+def plan_blocks(n_agents: int, agent_bytes: int, memory_limit: int) -> Blocks:
+    """Cut ``n_agents`` into equal blocks that fit into ``memory_limit`` bytes.
+
+    Raises:
+        PopulationTooLargeError: one agent per device does not fit.
+    """
+    devices = min(jax.local_device_count(), n_agents)
+    per_device = AGENTS_PER_CORE if jax.default_backend() == "cpu" else AGENTS_PER_ACCELERATOR
+    largest = min(memory_limit // agent_bytes, per_device * devices) // devices * devices
+    if largest == 0 and memory_limit >= agent_bytes:
+        devices = largest = 1
+    if largest == 0:
+        raise PopulationTooLargeError(
+            f"one agent needs {agent_bytes / 2**30:.1f} GiB and {memory_limit / 2**30:.1f} GiB are free; "
+            "lower the steps or the replay capacity"
+        )
+    count = -(-n_agents // largest)
+    size = -(-n_agents // (count * devices)) * devices
+    return Blocks(count=count, size=size, devices=devices, bytes=size * agent_bytes)
+
+
+@dataclass(frozen=True)
+class Validation:
+    """When and how the greedy policy is looked at during training.
+
+    Attributes:
+        every: environment steps of one agent between looks, rounded to whole iterations.
+        draws: volume draws per look.
+        chunks: jitted chunks per look, for the progress display and the training curve.
+    """
+
+    every: int = 10_000
+    draws: int = 8
+    chunks: int = 4
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One line of news from the host loop, after every chunk."""
+
+    block: int
+    steps: int
+    """Environment steps made by the whole population."""
+    of_steps: int
+    mean_length: float
+    """Mean length of the training episodes that ended in the chunk, slots."""
+
+
+@dataclass(frozen=True)
+class TrainedBlock:
+    """What one block leaves; NumPy arrays, ``B`` the agents of the block (padding removed).
+
+    Attributes:
+        agents: slice of the population that it holds.
+        last: weights after the last step, leaves ``[B, ...]``.
+        best: weights of the best look, leaves ``[B, ...]``.
+        best_step: ``[B]`` environment step of the best look.
+        best_score: ``[B]`` mean validation lifetime of the best look, slots.
+        diverged_at: ``[B]`` step at which an agent was frozen, -1 if it was not.
+        chunk_steps: ``[C]`` environment steps of one agent at the end of each chunk.
+        episode_length: ``[B, C]`` mean length of the training episodes that ended in each chunk (NaN if none did).
+        look_steps: ``[L]`` environment steps of one agent at each look.
+        validation: ``[B, L]`` mean validation lifetime at each look.
+        seconds: wall time by activity: ``compile``, ``train``, ``validate``.
+    """
+
+    agents: slice
+    last: Any
+    best: Any
+    best_step: np.ndarray
+    best_score: np.ndarray
+    diverged_at: np.ndarray
+    chunk_steps: np.ndarray
+    episode_length: np.ndarray
+    look_steps: np.ndarray
+    validation: np.ndarray
+    seconds: dict[str, float]
+
+
+@struct.dataclass
+class Best:
+    """The best weights so far: ``weights`` leaves ``[B, ...]``, their validation ``score`` and ``step`` ``[B]``."""
+
+    weights: Any
+    score: Any
+    step: Any
+
+
+def train(
+    algorithm: Algorithm,
+    agents: Agent,
+    validation_keys: PRNGKeyArray,
+    *,
+    validation: Validation,
+    blocks: Blocks,
+    on_progress: Callable[[Progress], None] = lambda _: None,
+) -> Iterator[TrainedBlock]:
+    """Train a population block by block, yielding each block as it is finished.
+
+    Args:
+        algorithm: what trains.
+        agents: the population, leaves ``[A, ...]``.
+        validation_keys: ``[A, validation.draws]`` volume draws for the looks.
+        validation: the looks during training.
+        blocks: from :func:`plan_blocks`.
+        on_progress: told after every chunk.
+    """
+    n_agents = validation_keys.shape[0]
+    mesh = Mesh(np.array(jax.local_devices()[: blocks.devices]), (AGENTS_AXIS,))
+    started = time.perf_counter()
+    programs = _Programs.compile(algorithm, mesh, _take(agents, validation_keys, 0, blocks.size))
+    compile_seconds = time.perf_counter() - started
+    for block in range(blocks.count):
+        first = block * blocks.size
+        real = min(blocks.size, n_agents - first)
+        members = jax.device_put(
+            _take(agents, validation_keys, first, blocks.size), NamedSharding(mesh, PartitionSpec(AGENTS_AXIS))
+        )
+
+        def report(steps: int, mean_length: float, block: int = block, first: int = first, real: int = real) -> None:
+            done = first * algorithm.total_steps + real * steps
+            on_progress(Progress(block, done, n_agents * algorithm.total_steps, mean_length))
+
+        trained = _train_block(algorithm, programs, members, validation, slice(first, first + real), report)
+        trained.seconds["compile"] = compile_seconds if block == 0 else 0.0
+        yield trained
+
+
+def _take(agents: Agent, keys: PRNGKeyArray, first: int, size: int) -> tuple[Agent, PRNGKeyArray]:
+    """``size`` agents from ``first`` on; past the end the last one is repeated, to keep the shape."""
+    places = np.minimum(np.arange(first, first + size), keys.shape[0] - 1)
+    taken: tuple[Agent, PRNGKeyArray] = jax.tree.map(lambda leaf: leaf[places], (agents, keys))
+    return taken
+
+
+@dataclass(frozen=True)
+class _Programs:
+    """The compiled programs of one block shape."""
+
+    init: Callable
+    update: Callable
+    look: Callable
+
+    @classmethod
+    def compile(cls, algorithm: Algorithm, mesh: Mesh, example: tuple[Agent, PRNGKeyArray]) -> "_Programs":
+        split, shared = PartitionSpec(AGENTS_AXIS), PartitionSpec()
+
+        def over_agents(function: Callable, n_split: int, n_shared: int = 0, **jit: Any) -> Any:
+            batched = jax.vmap(function, (0,) * n_split + (None,) * n_shared, axis_name=AGENTS_AXIS)
+            specs = (split,) * n_split + (shared,) * n_shared
+            # check_vma: the branch in `update` is decided per device, which the checker has no type for.
+            mapped = jax.shard_map(batched, mesh=mesh, in_specs=specs, out_specs=split, check_vma=False)
+            return jax.jit(mapped, **jit)
+
+        sharding = NamedSharding(mesh, split)
+        struct_of = lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)  # noqa: E731
+        agents, keys = jax.tree.map(struct_of, example)
+        init = over_agents(algorithm.init, 1)
+        state = jax.tree.map(struct_of, jax.eval_shape(init, agents))
+        batch = sharding.shard_shape((keys.shape[0],))[0] * mesh.size
+        number = jax.ShapeDtypeStruct((batch,), np.float32, sharding=sharding)
+        best = Best(weights=state.weights, score=number, step=jax.ShapeDtypeStruct((batch,), np.int32, sharding=sharding))
+        options = _compiler_options()
+        update = over_agents(algorithm.update, 2, 2, donate_argnums=1, compiler_options=options)
+        look = over_agents(partial(_look, algorithm), 4, 1, donate_argnums=3)
+        return cls(
+            init=init.lower(agents).compile(),
+            update=update.lower(agents, state, 0, 1).compile(),
+            look=look.lower(agents, keys, state.weights, best, 0).compile(),
+        )
+
+
+def _compiler_options() -> dict[str, bool]:
+    """One core per device: XLA's schedule for concurrent execution only costs memory traffic (7 % of the speed)."""
+    return {"xla_cpu_enable_concurrency_optimized_scheduler": False} if jax.default_backend() == "cpu" else {}
+
+
+def _look(algorithm: Algorithm, agent: Agent, keys: PRNGKeyArray, weights: Any, best: Best, step: Any) -> Any:
+    """Mean validation lifetime of the greedy policy of one agent, and the best so far (ties keep the earlier)."""
+    scenario = agent.scenario
+    policy = algorithm.policy(agent.hyper, weights)
+    score = jnp.mean(rollouts(policy, scenario.params, scenario.layout, keys).length.astype(jnp.float32))
+    better = score > best.score
+    kept = jax.tree.map(lambda new, old: jnp.where(better, new, old), (weights, score, step), (best.weights, best.score, best.step))
+    return score, Best(*kept)
+
+
+def _train_block(
+    algorithm: Algorithm,
+    programs: _Programs,
+    members: tuple[Agent, PRNGKeyArray],
+    validation: Validation,
+    agents: slice,
+    report: Callable[[int, float], None],
+) -> TrainedBlock:
+    """Train one block to the end: chunks, looks, curves."""
+    agent, keys = members
+    state = programs.init(agent)
+    size = keys.shape[0]
+    shard = state.diverged_at.sharding
+    best = Best(
+        weights=jax.tree.map(jnp.copy, state.weights),
+        score=jax.device_put(jnp.full((size,), -1.0), shard),
+        step=jax.device_put(jnp.zeros((size,), jnp.int32), shard),
+    )
+    seconds = {"train": 0.0, "validate": 0.0}
+    slots, episodes, chunk_ends, scores, look_ends = [], [], [], [], []
+    for first, last, is_look in _chunks(algorithm, validation):
+        tick = time.perf_counter()
+        state = programs.update(agent, state, np.int32(first), np.int32(last))
+        slots.append(np.asarray(state.episode_slots))
+        episodes.append(np.asarray(state.episodes))
+        seconds["train"] += time.perf_counter() - tick
+        steps = last * algorithm.steps_per_iteration
+        chunk_ends.append(steps)
+        if is_look:
+            tick = time.perf_counter()
+            score, best = programs.look(agent, keys, state.weights, best, np.int32(steps))
+            scores.append(np.asarray(score))
+            look_ends.append(steps)
+            seconds["validate"] += time.perf_counter() - tick
+        report(steps, float(slots[-1].sum() / max(episodes[-1].sum(), 1)))
+
+    real = agents.stop - agents.start
+    keep: Callable[[Any], Any] = lambda tree: jax.tree.map(lambda leaf: np.asarray(leaf)[:real], tree)  # noqa: E731
+    counts = np.stack(episodes, 1)[:real]
+    return TrainedBlock(
+        agents=agents,
+        last=keep(state.weights),
+        best=keep(best.weights),
+        best_step=keep(best.step),
+        best_score=keep(best.score),
+        diverged_at=keep(state.diverged_at),
+        chunk_steps=np.array(chunk_ends),
+        episode_length=np.where(counts > 0, np.stack(slots, 1)[:real] / np.maximum(counts, 1), np.nan).astype(np.float32),
+        look_steps=np.array(look_ends),
+        validation=np.stack(scores, 1)[:real],
+        seconds=seconds,
+    )
+
+
+def _chunks(algorithm: Algorithm, validation: Validation) -> Iterator[tuple[int, int, bool]]:
+    """``(first, last, whether a look follows)`` for every chunk; the last chunk always ends with a look."""
+    every = max(validation.every // algorithm.steps_per_iteration, 1)
+    for start in range(0, algorithm.iterations, every):
+        stop = min(start + every, algorithm.iterations)
+        edges = np.linspace(start, stop, min(validation.chunks, stop - start) + 1).astype(int)
+        for first, last in zip(edges[:-1], edges[1:], strict=True):
+            yield int(first), int(last), last == stop

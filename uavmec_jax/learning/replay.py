@@ -1,0 +1,151 @@
+"""Replay memory: one row of 32-bit words per transition, 64 bytes for twelve devices.
+
+A row holds what a transition *adds*: the observation it led to, its action, reward and flags. The observation it
+started from is the previous row's, or the initial one if an episode ended there. So a sample costs two neighbouring
+rows (two cache lines) instead of five scattered arrays, and 75 agents x 1,000,000 transitions fit in 4.5 GiB.
+Battery fractions and rewards are kept to the bit; ages are small integers and are packed.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, UInt
+
+_ACTION_BITS = 8
+_TERMINATED = 1 << _ACTION_BITS
+_ENDED = 2 << _ACTION_BITS
+
+
+class Transition(NamedTuple):
+    """A batch of transitions, leading axis ``B``.
+
+    ``observation`` and ``next_observation`` are f32 ``[B, 2n]``, ``action`` int32 ``[B]``, ``reward`` f32 ``[B]``,
+    ``terminated`` f32 ``[B]`` (1 where the bootstrap is cut).
+    """
+
+    observation: Array
+    action: Array
+    reward: Array
+    terminated: Array
+    next_observation: Array
+
+
+@dataclass(frozen=True)
+class ReplaySpec:
+    """Shape of one agent's memory (static).
+
+    Attributes:
+        n_devices: devices, at most 256.
+        capacity: transitions that can be sampled.
+        stride: transitions written at a time; the ring is a multiple of it, so a write never wraps.
+        max_age: largest age that can occur, slots.
+        wraps: whether more than ``capacity`` transitions will ever be written.
+    """
+
+    n_devices: int
+    capacity: int
+    stride: int = 4
+    max_age: int = 11
+    wraps: bool = True
+
+    @property
+    def ring(self) -> int:
+        """Transitions held: the capacity plus at least the one whose start the oldest needs, in whole strides."""
+        held = self.capacity + (1 if self.wraps else 0)
+        return -(-held // self.stride) * self.stride
+
+    @property
+    def age_bits(self) -> int:
+        """Bits per packed age."""
+        return max(int(self.max_age).bit_length(), 1)
+
+    @property
+    def ages_per_word(self) -> int:
+        """Ages in one 32-bit word."""
+        return 32 // self.age_bits
+
+    @property
+    def words(self) -> int:
+        """Words per row: batteries, packed ages, reward, and one for action and flags."""
+        return self.n_devices + -(-self.n_devices // self.ages_per_word) + 2
+
+    @property
+    def bytes(self) -> int:
+        """Memory of one agent, bytes."""
+        return 4 * (self.ring + 1) * self.words
+
+
+def init(spec: ReplaySpec) -> UInt[Array, "rows words"]:
+    """An empty memory ``[ring + 1, words]``; row 0 stands before the first transition and says an episode ended there."""
+    rows = jnp.zeros((spec.ring + 1, spec.words), jnp.uint32)
+    return rows.at[0, -1].set(_ENDED)
+
+
+def pack(
+    spec: ReplaySpec,
+    action: Int[Array, ""],
+    reward: Float[Array, ""],
+    battery_fraction: Float[Array, " n"],
+    age: Int[Array, " n"],
+    terminated: Bool[Array, ""],
+    ended: Bool[Array, ""],
+) -> UInt[Array, " words"]:
+    """One row from what a slot led to; ``ended`` is terminated or truncated."""
+    words = -(-spec.n_devices // spec.ages_per_word)
+    padded = jnp.pad(age.astype(jnp.uint32), (0, words * spec.ages_per_word - spec.n_devices))
+    shifts = np.arange(spec.ages_per_word, dtype=np.uint32) * spec.age_bits
+    ages = jnp.sum(padded.reshape(words, spec.ages_per_word) << shifts, axis=-1, dtype=jnp.uint32)
+    tag = action.astype(jnp.uint32) | jnp.where(terminated, _TERMINATED, 0).astype(jnp.uint32)
+    tag = tag | jnp.where(ended, _ENDED, 0).astype(jnp.uint32)
+    bits = jax.lax.bitcast_convert_type
+    return jnp.concatenate([bits(battery_fraction, jnp.uint32), ages, bits(reward, jnp.uint32)[None], tag[None]])
+
+
+def add(
+    spec: ReplaySpec, rows: UInt[Array, "rows words"], written: Int[Array, ""], new: UInt[Array, "stride words"]
+) -> UInt[Array, "rows words"]:
+    """Write ``stride`` rows; ``written`` (a multiple of ``stride``) transitions were written before."""
+    place = written % spec.ring
+    rows = jax.lax.dynamic_update_slice(rows, new, (place + 1, 0))
+    if spec.wraps:  # row 0 is the neighbour of row 1: once the ring is full, the ring's last row
+        first = jnp.where(place + spec.stride == spec.ring, new[-1], rows[0])
+        rows = jax.lax.dynamic_update_slice(rows, first[None], (0, 0))
+    return rows
+
+
+def sample(
+    spec: ReplaySpec, rows: UInt[Array, "rows words"], written: Int[Array, ""], bits: UInt[Array, " B"]
+) -> Transition:
+    """Draw transitions uniformly with replacement from the newest ``min(written, capacity)``.
+
+    Args:
+        spec: shape of the memory.
+        rows: the memory.
+        written: transitions written so far, at least 1.
+        bits: ``[B]`` uniform 32-bit words, one per draw. (The modulo's bias is below capacity / 2**32.)
+    """
+    size = jnp.minimum(written, spec.capacity)
+    back = (bits % size.astype(jnp.uint32)).astype(jnp.int32)
+    place = (written - 1 - back) % spec.ring
+    pairs = jax.vmap(lambda start: jax.lax.dynamic_slice(rows, (start, 0), (2, spec.words)))(place)
+    before, row = pairs[:, 0], pairs[:, 1]
+    first = np.concatenate([np.ones(spec.n_devices, np.float32), np.zeros(spec.n_devices, np.float32)])
+    return Transition(
+        observation=jnp.where((before[:, -1:] & _ENDED) > 0, first, _observation(spec, before)),
+        action=(row[:, -1] & (_TERMINATED - 1)).astype(jnp.int32),
+        reward=jax.lax.bitcast_convert_type(row[:, -2], jnp.float32),
+        terminated=((row[:, -1] & _TERMINATED) > 0).astype(jnp.float32),
+        next_observation=_observation(spec, row),
+    )
+
+
+def _observation(spec: ReplaySpec, row: UInt[Array, "B words"]) -> Float[Array, "B two_n"]:
+    """The observation a row led to."""
+    n = spec.n_devices
+    shifts = (np.arange(n, dtype=np.uint32) % spec.ages_per_word) * spec.age_bits
+    words = jnp.repeat(row[:, n:-2], spec.ages_per_word, axis=-1)[:, :n]
+    ages = (words >> shifts) & np.uint32(2**spec.age_bits - 1)
+    return jnp.concatenate([jax.lax.bitcast_convert_type(row[:, :n], jnp.float32), ages.astype(jnp.float32)], axis=-1)

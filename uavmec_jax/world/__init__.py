@@ -1,0 +1,1 @@
+"""The world: hardware tables, layouts, physics, rewards, environment. Imports nothing above it."""

@@ -1,0 +1,88 @@
+"""Layouts: what one random draw, or one user's inventory, fixes about the devices."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from uavmec_jax.world import tables
+from uavmec_jax.world.params import Params
+
+
+@struct.dataclass
+class Layout:
+    """The devices of one scenario; every field has one entry per device, batches put their axes in front.
+
+    Attributes:
+        position: ``[n, 2]`` m, in the region.
+        device_type: ``[n]`` int, index into :data:`tables.DEVICE_TYPES`.
+        task: ``[n]`` int, index into :data:`tables.TASKS`.
+        capacity: ``[n]`` J, battery capacity.
+        has_power: ``[n]`` bool, grid power is there (delta_E = 0).
+        has_comms: ``[n]`` bool, communication is there (delta_C = 0).
+        standby_power: ``[n]`` W, from the type.
+        active_power: ``[n]`` W, from type and task.
+        processing_rate: ``[n]`` bytes/s, from type and task.
+    """
+
+    position: Any
+    device_type: Any
+    task: Any
+    capacity: Any
+    has_power: Any
+    has_comms: Any
+    standby_power: Any
+    active_power: Any
+    processing_rate: Any
+
+
+def make_layout(
+    position: Float[Array, "n 2"],
+    device_type: Int[Array, " n"],
+    task: Int[Array, " n"],
+    capacity: Float[Array, " n"],
+    has_power: Bool[Array, " n"],
+    has_comms: Bool[Array, " n"],
+) -> Layout:
+    """Look up powers and rates (Tables 1-3) and return the complete :class:`Layout`."""
+    return Layout(
+        position=position,
+        device_type=device_type,
+        task=task,
+        capacity=capacity,
+        has_power=has_power,
+        has_comms=has_comms,
+        standby_power=jnp.asarray(tables.STANDBY_POWER_W)[device_type],
+        active_power=jnp.asarray(tables.ACTIVE_POWER_W)[task, device_type],
+        processing_rate=jnp.asarray(tables.PROCESSING_RATE_BYTES_S)[task, device_type],
+    )
+
+
+def sample_layout(key: PRNGKeyArray, params: Params, n_powered: Any, n_connected: Any) -> Layout:
+    """Draw a random layout (paper, section 3.1).
+
+    Positions are uniform in the region, type and task uniform over Tables 2-3, capacity uniform in its range. Exactly
+    ``n_powered`` devices have grid power and exactly ``n_connected`` have communication; the two sets are uniform and
+    independent. With one key, layouts of different counts differ in the masks alone, and the masks are nested: lowering
+    a count takes the resource from further devices of the same town.
+
+    Args:
+        key: typed PRNG key.
+        params: scenario parameters; ``n_devices`` fixes the shapes.
+        n_powered: devices with power, int in ``[0, n]``; may be traced.
+        n_connected: devices with communication, int in ``[0, n]``; may be traced.
+    """
+    n = params.n_devices
+    k_position, k_type, k_task, k_capacity, k_power, k_comms = jax.random.split(key, 6)
+    low, high = params.device_battery_range_j
+    region = jnp.stack([jnp.asarray(side, jnp.float32) for side in params.region_m])
+    return make_layout(
+        position=jax.random.uniform(k_position, (n, 2)) * region,
+        device_type=jax.random.randint(k_type, (n,), 0, len(tables.DEVICE_TYPES)),
+        task=jax.random.randint(k_task, (n,), 0, len(tables.TASKS)),
+        capacity=jax.random.uniform(k_capacity, (n,), minval=low, maxval=high),
+        has_power=jax.random.permutation(k_power, n) < n_powered,
+        has_comms=jax.random.permutation(k_comms, n) < n_connected,
+    )

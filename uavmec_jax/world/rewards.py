@@ -1,0 +1,114 @@
+"""Rewards: weight vectors over eight terms; the eleven of Table 6 by name (paper, section 3.2 and Table 6)."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float, Int
+
+from uavmec_jax.world.layout import Layout
+from uavmec_jax.world.physics import State
+
+TERMS: tuple[str, ...] = ("A", "U", "M", "O", "log A", "log U", "log M", "log O")
+"""The terms a reward weighs, in the order of a weight vector.
+
+A: age of the visited device before the visit. U: slots completed after this one. M: lowest battery fraction after the
+slot. O: oldest age before the visit.
+"""
+
+LOG_GUARDS: tuple[str, ...] = ("clamp", "log1p")
+"""What the logarithms do at zero: ``clamp`` is log(max(x, 1e-6)); ``log1p`` is log(x + 1) for the ages A and O."""
+
+_SMALLEST = 1e-6
+
+
+def make_weights(terms: Mapping[str, float]) -> np.ndarray:
+    """Turn ``{"U": 1.0, "log A": 1.0}`` into a weight vector ``[8]``.
+
+    Raises:
+        ValueError: a term is not one of :data:`TERMS`, or a weight is not finite.
+    """
+    weights = np.zeros(len(TERMS), np.float32)
+    for term, weight in terms.items():
+        if term not in TERMS:
+            raise ValueError(f"unknown reward term {term!r}; terms are {', '.join(TERMS)}")
+        if not np.isfinite(weight):
+            raise ValueError(f"weight of reward term {term!r} is {weight}; it must be a finite number")
+        weights[TERMS.index(term)] = weight
+    weights.setflags(write=False)
+    return weights
+
+
+DEFAULT_REWARD = "U+log(A/O)"
+"""The reward the paper found best, the last row of Table 6."""
+
+REWARDS: Mapping[str, np.ndarray] = MappingProxyType(
+    {
+        "A": make_weights({"A": 1}),
+        "U": make_weights({"U": 1}),
+        "M": make_weights({"M": 1}),
+        "-O": make_weights({"O": -1}),
+        "A+U+M-O": make_weights({"A": 1, "U": 1, "M": 1, "O": -1}),
+        "log A": make_weights({"log A": 1}),
+        "log U": make_weights({"log U": 1}),
+        "log M": make_weights({"log M": 1}),
+        "-log O": make_weights({"log O": -1}),
+        "log A+log U+log M-log O": make_weights({"log A": 1, "log U": 1, "log M": 1, "log O": -1}),
+        DEFAULT_REWARD: make_weights({"U": 1, "log A": 1, "log O": -1}),
+    }
+)
+"""The eleven rewards of Table 6: name -> weights ``[8]`` over :data:`TERMS`."""
+
+
+@struct.dataclass
+class Reward:
+    """A linear reward.
+
+    Attributes:
+        weights: ``[8]`` over :data:`TERMS`.
+        log1p: bool; the guard of the logarithms, see :data:`LOG_GUARDS`.
+    """
+
+    weights: Any
+    log1p: Any = False
+
+
+def make_reward(reward: str | Mapping[str, float] = DEFAULT_REWARD, guard: str = "clamp") -> Reward:
+    """Return a :class:`Reward` from a name of Table 6 or from weights of one's own.
+
+    Raises:
+        ValueError: unknown name, term or guard.
+    """
+    if guard not in LOG_GUARDS:
+        raise ValueError(f"unknown log guard {guard!r}; guards are {', '.join(LOG_GUARDS)}")
+    if isinstance(reward, str):
+        if reward not in REWARDS:
+            raise ValueError(f"unknown reward {reward!r}; rewards are {', '.join(REWARDS)}")
+        weights = REWARDS[reward]
+    else:
+        weights = make_weights(reward)
+    return Reward(weights=jnp.asarray(weights), log1p=jnp.asarray(guard == "log1p"))
+
+
+def reward_terms(
+    layout: Layout, before: State, action: Int[Array, ""], after: State, log1p: Any = False
+) -> Float[Array, "8"]:
+    """The eight :data:`TERMS` of one slot, given the states around it."""
+    visited_age = before.age[action].astype(jnp.float32)
+    oldest_age = jnp.max(before.age).astype(jnp.float32)
+    slots = after.slot.astype(jnp.float32)
+    lowest_battery = jnp.min(after.battery / layout.capacity)
+    plain = jnp.stack([visited_age, slots, lowest_battery, oldest_age])
+    is_age = np.array([True, False, False, True])
+    guarded = jnp.where(log1p & is_age, plain + 1.0, jnp.maximum(plain, _SMALLEST))
+    return jnp.concatenate([plain, jnp.log(guarded)])
+
+
+def reward_of(
+    reward: Reward, layout: Layout, before: State, action: Int[Array, ""], after: State
+) -> Float[Array, ""]:
+    """The scalar reward of one slot."""
+    return jnp.dot(reward.weights, reward_terms(layout, before, action, after, reward.log1p))
