@@ -5,7 +5,7 @@ environment steps and one gradient step. The population (:mod:`uavmec_jax.learni
 ``vmap``: the iteration number is shared by all agents and never batched, everything of one agent is.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -56,10 +56,10 @@ class DQNSpec:
     total_steps: int = 1_000_000
     """Environment steps of one agent; rounded up to whole iterations."""
     hidden: tuple[int, ...] = (64, 64)
-    batch_size: int = 16
-    train_frequency: int = 4
+    batch_size: int = field(default=16, metadata={"ge": 1})
+    train_frequency: int = field(default=4, metadata={"ge": 1, "le": 64})
     """Environment steps per gradient step."""
-    replay_capacity: int = 1_000_000
+    replay_capacity: int = field(default=1_000_000, metadata={"ge": 1})
     n_devices: int = 12
     max_age: int = 11
 

@@ -1,0 +1,183 @@
+"""The command `uavmec`: parse, call, show. What it does lives in the package; jax is imported only when needed."""
+
+import json
+import sys
+import time
+import tomllib
+from pathlib import Path
+from typing import Any, NoReturn
+
+import click
+
+QUICK_STEPS, QUICK_SEEDS, QUICK_VALIDATE_EVERY = 50_000, 3, 5_000
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="uavmec-jax")
+def main() -> None:
+    """Which device should a rescue UAV serve next, and which will fail first?
+
+    \b
+    uavmec run table5 --quick     the paper's Table 5 on this machine, in under a minute
+    uavmec run my-study.toml      a study of your own
+    uavmec show runs/...          the tables of a run again
+    """
+
+
+@main.command()
+@click.argument("study")
+@click.option("--seeds", type=int, help="Number of seeds (axes.seeds).")
+@click.option("--steps", type=int, help="Environment steps of one agent.")
+@click.option("--quick", is_flag=True, help=f"{QUICK_SEEDS} seeds x {QUICK_STEPS:,} steps: a first look within a minute.")
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="Override any setting, e.g. --set dqn.gamma=0.99 or --set axes.learning_rate=[0.001,0.0071].",
+)
+@click.option("--out", type=click.Path(path_type=Path), help="Folder of the run (default: runs/<study>-<time>).")
+@click.option("--json", "as_json", is_flag=True, help="Print the cells as JSON on standard output.")
+def run(
+    study: str,
+    seeds: int | None,
+    steps: int | None,
+    quick: bool,
+    settings: tuple[str, ...],
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Train and judge STUDY: a study that ships with the package (table5, table5-tuned) or a TOML file."""
+    overrides: dict[str, Any] = {}
+    if quick:
+        overrides |= {
+            "axes.seeds": QUICK_SEEDS,
+            "steps": QUICK_STEPS,
+            "evaluation.validate_every": QUICK_VALIDATE_EVERY,
+        }
+    overrides |= {name: value for name, value in (("axes.seeds", seeds), ("steps", steps)) if value is not None}
+    overrides |= dict(_setting(setting) for setting in settings)
+
+    from uavmec_jax.studies import host
+
+    host.use_every_core()
+    from rich.console import Console
+
+    from uavmec_jax.reporting import figures
+    from uavmec_jax.reporting.progress import progress_bar
+    from uavmec_jax.studies.run import check_directory, plan_study, run_study
+    from uavmec_jax.studies.schema import StudyError
+    from uavmec_jax.studies.study import load_study
+
+    console = Console(stderr=as_json)
+    try:
+        resolved = load_study(study, overrides)
+        directory = out or Path("runs") / f"{resolved.name}-{time.strftime('%Y%m%d-%H%M%S')}"
+        check_directory(directory)
+        plan = plan_study(resolved)
+        console.print(f"[bold]{resolved.name}[/bold]: {plan}")
+        with progress_bar(console, plan) as on_progress:
+            results = run_study(resolved, directory, command=_command(), on_progress=on_progress)
+    except StudyError as error:
+        _fail(error)
+    except OSError as error:
+        _fail(f"{error.filename or out}: {error.strerror or error}")
+    if len(results.agents):
+        figures.save(figures.run_figure(results), directory / "figure.png")
+        _print(results, directory, console, as_json)
+    if not results.run["complete"]:
+        done = len(results.agents)
+        kept = f"{done} finished agents are kept in {directory}" if done else "no block was finished, nothing was kept"
+        click.echo(f"interrupted: {kept}", err=True)
+        sys.exit(130)
+
+
+@main.command()
+@click.argument("directory", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print the cells as JSON on standard output.")
+def show(directory: Path, as_json: bool) -> None:
+    """Print the tables of the run in DIRECTORY again."""
+    from rich.console import Console
+
+    from uavmec_jax.studies.results import load_results
+    from uavmec_jax.studies.schema import StudyError
+
+    try:
+        results = load_results(directory)
+    except StudyError as error:
+        _fail(error)
+    _print(results, directory, Console(stderr=as_json), as_json)
+
+
+@main.command()
+@click.argument("file")
+@click.option("--json", "as_json", is_flag=True, help="Print the resolved study as JSON.")
+def validate(file: str, as_json: bool) -> None:
+    """Check the study FILE (or a shipped study) without running it."""
+    from uavmec_jax.studies.schema import StudyError
+    from uavmec_jax.studies.study import load_study, n_agents
+
+    try:
+        study = load_study(file)
+    except StudyError as error:
+        _fail(error)
+    if as_json:
+        click.echo(study.model_dump_json(indent=1))
+    else:
+        click.echo(f"{file}: a valid study: {n_agents(study):,} agents x {study.steps:,} steps")
+
+
+@main.command()
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
+def doctor(as_json: bool) -> None:
+    """Say versions, devices and memory, and check the speed for two seconds."""
+    from uavmec_jax.studies import host
+
+    host.use_every_core()
+    from uavmec_jax.studies.speed import environment_speed
+
+    facts = host.describe() | {"environment_steps_per_second": round(environment_speed(seconds=2.0))}
+    if as_json:
+        click.echo(json.dumps(facts, indent=1))
+        return
+    for name, value in facts.items():
+        if isinstance(value, dict):
+            value = ", ".join(f"{key} {version}" for key, version in value.items())
+        elif isinstance(value, list):
+            value = ", ".join(value)
+        click.echo(f"{name.replace('_', ' '):>30}  {value:,}" if isinstance(value, int) else f"{name.replace('_', ' '):>30}  {value}")
+
+
+def _setting(text: str) -> tuple[str, Any]:
+    """``name=value`` with the value as in TOML; a bare word is a string."""
+    name, equals, value = text.partition("=")
+    if not equals or not name.strip():
+        _fail(f"--set {text}: give NAME=VALUE, e.g. --set dqn.gamma=0.99")
+    try:
+        return name.strip(), tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return name.strip(), value.strip()
+
+
+def _print(results: Any, directory: Path, console: Any, as_json: bool) -> None:
+    from uavmec_jax.reporting.tables import summary, tables
+
+    if as_json:
+        cells = json.loads(results.cells().to_json(orient="records"))
+        click.echo(json.dumps({"directory": str(directory), "run": results.run, "cells": cells}, indent=1))
+        return
+    for table in tables(results):
+        console.print(table)
+    for line in summary(results):
+        console.print(line, highlight=False)
+    console.print(f"Files: {directory}", highlight=False, soft_wrap=True)
+
+
+def _command() -> str:
+    return " ".join(["uavmec", *sys.argv[1:]])
+
+
+def _fail(message: object) -> NoReturn:
+    """One line on standard error, exit code 2."""
+    click.echo(f"uavmec: {' '.join(str(message).split())}", err=True)
+    sys.exit(2)

@@ -1,0 +1,115 @@
+"""Tables for the terminal, from results alone."""
+
+from typing import Any
+
+import pandas as pd
+from rich.table import Table
+from rich.text import Text
+
+from uavmec_jax.studies.paper import TABLE5
+from uavmec_jax.studies.results import Results
+from uavmec_jax.studies.study import cell_axes
+
+NOTICEABLE_SLOTS = 0.5
+"""Differences from the paper below this many slots are not coloured: the paper rounds, and averages few seeds."""
+
+
+def is_grid(results: Results) -> bool:
+    """Whether the cells of a study are power x comms and nothing else."""
+    return cell_axes(results.study) == ["powered", "connected"]
+
+
+def tables(results: Results) -> list[Table]:
+    """The tables of a run: the paper's Table 5 where the study is such a grid, else a list of cells."""
+    cells = results.cells()
+    if is_grid(results):
+        return [grid_table(results, cells, "best"), grid_table(results, cells, "last"), failure_table(cells)]
+    return [list_table(results, cells)]
+
+
+def grid_table(results: Results, cells: pd.DataFrame, policy: str) -> Table:
+    """Lifetimes in slots: ours +- half the 95 % interval / paper / oldest-first."""
+    baseline = "oldest_first" if "oldest_first" in results.policies else None
+    parts = ["ours ± 95 %", "paper", *(["oldest-first"] if baseline else [])]
+    title = f"Lifetime in slots, `{policy}` weights: {' / '.join(parts)}"
+    return _grid(cells, title, lambda cell: _lifetime(cell, policy, baseline))
+
+
+def _lifetime(cell: Any, policy: str, baseline: str | None) -> Text:
+    paper = TABLE5.get((cell["powered"], cell["connected"]))
+    text = Text(f"{cell[policy]:.1f}", style=_style(cell[policy], paper))
+    half = (cell[f"{policy}_high"] - cell[f"{policy}_low"]) / 2
+    text.append(f" ±{half:.1f}" if half == half else " ±?", style="dim")
+    text.append(f" / {paper:g}" if paper is not None else " / -", style="not bold default")
+    if baseline:
+        text.append(f" / {cell[baseline]:.1f}", style="not bold default")
+    return text
+
+
+def _style(ours: float, paper: float | None) -> str:
+    if paper is None or abs(ours - paper) < NOTICEABLE_SLOTS:
+        return "bold"
+    return "bold green" if ours > paper else "bold red"
+
+
+def failure_table(cells: pd.DataFrame) -> Table:
+    """The device that fails first most often under the best weights, and in what share of the episodes."""
+
+    def first(cell: Any) -> Text:
+        if not cell["best_first_device"]:
+            return Text("UAV", style="dim")
+        return Text(f"#{cell['best_first_device']}", style="bold").append(
+            f" {cell['best_first_share']:.0%}", style="not bold dim"
+        )
+
+    return _grid(cells, "First to fail: device number, share of the held-out episodes (all seeds together)", first)
+
+
+def _grid(cells: pd.DataFrame, title: str, content: Any) -> Table:
+    table = Table(title=title, title_justify="left", title_style="bold")
+    connected = list(dict.fromkeys(cells["connected"]))
+    table.add_column("powered \\ connected", justify="right", style="bold")
+    for count in connected:
+        table.add_column(str(count), justify="right", no_wrap=True)
+    for powered in dict.fromkeys(cells["powered"]):
+        row = cells[cells["powered"] == powered].set_index("connected", drop=False)
+        texts = [content(row.loc[count]) if count in row.index else Text("") for count in connected]
+        table.add_row(str(powered), *texts)
+    return table
+
+
+def list_table(results: Results, cells: pd.DataFrame) -> Table:
+    """One line per cell: every policy's mean lifetime, the interval for the learned ones."""
+    axes = cell_axes(results.study)
+    table = Table(title="Lifetime in slots, mean over the seeds ± 95 %", title_justify="left", title_style="bold")
+    for name in (*axes, "seeds"):
+        table.add_column(name, justify="right")
+    for policy in results.policies:
+        table.add_column(policy.replace("_", "-"), justify="right")
+    table.add_column("first to fail", justify="right")
+    for _, cell in cells.iterrows():
+        lifetimes = []
+        for policy in results.policies:
+            half = (cell[f"{policy}_high"] - cell[f"{policy}_low"]) / 2
+            shown = policy in ("best", "last") and half == half
+            lifetimes.append(f"{cell[policy]:.1f}" + (f" ±{half:.1f}" if shown else ""))
+        first = f"#{cell['best_first_device']} {cell['best_first_share']:.0%}" if cell["best_first_device"] else "UAV"
+        table.add_row(*(f"{cell[name]:g}" if not isinstance(cell[name], str) else cell[name] for name in (*axes, "seeds")), *lifetimes, first)
+    return table
+
+
+def summary(results: Results) -> list[str]:
+    """A few lines below the tables: overall means and what the run cost."""
+    cells, run = results.cells(), results.run
+    means = ", ".join(f"{name.replace('_', '-')} {cells[name].mean():.2f}" for name in results.policies)
+    lines = [f"Mean over {len(cells)} cells, slots: {means}."]
+    if "training_steps_per_second" in run:
+        seconds = run["seconds"]
+        lines.append(
+            f"{run['agents_done']} of {run['agents']} agents, {run['environment_steps']:,} environment steps at "
+            f"{run['training_steps_per_second']:,}/s; compile {seconds['compile']:.0f} s, train {seconds['train']:.0f} s, "
+            f"validate {seconds['validate']:.1f} s, evaluate {seconds['evaluate']:.0f} s, in all {seconds['wall']:.0f} s."
+        )
+    if run.get("diverged"):
+        lines.append(f"{run['diverged']} agents diverged and were frozen; column diverged_at of agents.csv says when.")
+    return lines

@@ -1,0 +1,150 @@
+"""What a run leaves: files that are read back without pickle, each written whole or not at all."""
+
+import json
+import os
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import pandas as pd
+from flax import traverse_util
+
+from uavmec_jax.studies.schema import Study, StudyError
+from uavmec_jax.studies.statistics import mean_interval
+from uavmec_jax.studies.study import cell_axes, load_study, study_toml
+
+SCHEMA = 1
+"""Version of the run folder."""
+
+_STUDY, _RUN, _AGENTS = "study.toml", "run.json", "agents.csv"
+_CURVES, _EVALUATION, _WEIGHTS = "curves.npz", "evaluation.npz", "weights.npz"
+
+
+@dataclass
+class Results:
+    """One run, whole or as far as it got.
+
+    Attributes:
+        study: the resolved study.
+        run: what ``run.json`` holds: versions, hardware, command, seeds, times, speed.
+        agents: tidy table, one row per finished agent.
+        curves: ``chunk_steps [C]``, ``episode_length [A, C]``, ``look_steps [L]``, ``validation [A, L]``.
+        evaluation: per policy ``<name>/lifetime [A, D + 1]``, ``/cause``, ``/first_failure [A, D + 1, n]``.
+        weights: ``best/...`` and ``last/...``, leaves ``[A, ...]`` (empty when read back by :func:`load_results`).
+    """
+
+    study: Study
+    run: dict[str, Any]
+    agents: pd.DataFrame = field(default_factory=pd.DataFrame)
+    curves: dict[str, np.ndarray] = field(default_factory=dict)
+    evaluation: dict[str, np.ndarray] = field(default_factory=dict)
+    weights: dict[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def policies(self) -> list[str]:
+        """Policies in the table, as in its column names."""
+        return [name.removesuffix("_lifetime") for name in self.agents.columns if name.endswith("_lifetime")]
+
+    def add(self, rows: pd.DataFrame, curves: Mapping, evaluation: Mapping, weights: Mapping[str, Any]) -> None:
+        """Append the agents of one more block."""
+        flat = traverse_util.flatten_dict(dict(weights), sep="/")
+        self.agents = pd.concat([self.agents, rows], ignore_index=True)
+        for mine, theirs in ((self.curves, curves), (self.evaluation, evaluation), (self.weights, flat)):
+            for name, values in theirs.items():
+                shared = name.endswith("_steps")
+                mine[name] = np.concatenate([mine[name], values]) if name in mine and not shared else np.asarray(values)
+
+    def cells(self) -> pd.DataFrame:
+        """One row per cell: mean, interval and spread of every policy over the seeds, and who fails first."""
+        rows = []
+        for cell, group in self.agents.groupby(cell_axes(self.study), sort=False):
+            row: dict[str, Any] = dict(zip(cell_axes(self.study), cell, strict=True)) | {"seeds": len(group)}
+            for policy in self.policies:
+                mean, low, high = mean_interval(group[f"{policy}_lifetime"].to_numpy())
+                row |= {policy: mean, f"{policy}_low": low, f"{policy}_high": high}
+                row[f"{policy}_fixed"] = float(group[f"{policy}_lifetime_fixed"].mean())
+                share = self.first_failures(policy)[group.index].mean(axis=0)
+                row[f"{policy}_first_device"] = int(share.argmax()) + 1 if share.max() > 0 else 0
+                row[f"{policy}_first_share"] = float(share.max())
+            rows.append(row)
+        return pd.DataFrame(rows)
+
+    def first_failures(self, policy: str) -> np.ndarray:
+        """``[A, n]`` how often each device of each agent's layout is the first to fail, over the held-out draws."""
+        return self.evaluation[f"{policy}/first_failure"][:, :-1].mean(axis=1)
+
+    def save(self, directory: Path) -> None:
+        """Write every file of the run into ``directory``, each atomically; ``run.json`` last."""
+        directory.mkdir(parents=True, exist_ok=True)
+        _write(directory / _STUDY, lambda file: file.write(study_toml(self.study).encode()))
+        _write(directory / _AGENTS, lambda file: file.write(self.agents.to_csv(index=False, float_format="%.6g").encode()))
+        for name, arrays in ((_CURVES, self.curves), (_EVALUATION, self.evaluation), (_WEIGHTS, self.weights)):
+            _write(directory / name, lambda file, arrays=arrays: np.savez_compressed(file, **arrays))
+        _write(directory / _RUN, lambda file: file.write((json.dumps(self.run, indent=1) + "\n").encode()))
+
+
+def _write(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:
+    """Write a file whole or not at all."""
+    partial = path.with_name(f".{path.name}.part")
+    try:
+        with partial.open("wb") as file:
+            fill(file)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def holds_run(directory: Path) -> bool:
+    """Whether a folder holds a run."""
+    return (directory / _RUN).exists() or (directory / _STUDY).exists()
+
+
+def load_results(directory: str | Path) -> Results:
+    """Read a run back (all but its weights, see :func:`load_weights`).
+
+    Raises:
+        StudyError: the folder holds no run, a file of it is damaged, or it was written by a newer version.
+    """
+    directory = Path(directory)
+    if not (directory / _RUN).is_file():
+        raise StudyError(f"{directory}: holds no run ({_RUN} is not there)")
+    try:
+        run = json.loads((directory / _RUN).read_text(encoding="utf-8"))
+        agents = pd.read_csv(directory / _AGENTS)
+    except (OSError, ValueError) as error:
+        raise StudyError(f"{directory}: cannot be read: {error}") from None
+    if run.get("schema", SCHEMA) > SCHEMA:
+        raise StudyError(f"{directory / _RUN}: schema is {run['schema']}; this version reads up to {SCHEMA}")
+    return Results(
+        study=load_study(directory / _STUDY),
+        run=run,
+        agents=agents,
+        curves=_load_arrays(directory / _CURVES),
+        evaluation=_load_arrays(directory / _EVALUATION),
+    )
+
+
+def load_weights(directory: str | Path, which: str = "best") -> dict[str, Any]:
+    """Trained weights of a run as the networks take them, leaves ``[A, ...]`` in the order of ``agents.csv``.
+
+    Raises:
+        StudyError: there are none, or the file is damaged.
+    """
+    arrays = _load_arrays(Path(directory) / _WEIGHTS)
+    chosen = {name.removeprefix(f"{which}/"): leaf for name, leaf in arrays.items() if name.startswith(f"{which}/")}
+    if not chosen:
+        raise StudyError(f"{Path(directory) / _WEIGHTS}: holds no {which!r} weights; give 'best' or 'last'")
+    return traverse_util.unflatten_dict(chosen, sep="/")
+
+
+def _load_arrays(path: Path) -> dict[str, np.ndarray]:
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        raise StudyError(f"{path}: cannot be read: {error}") from None

@@ -1,0 +1,190 @@
+"""Study files: what may stand in one, and one clear line for whatever may not.
+
+The numbers of Table 1 and the hyperparameters are declared once, as pytrees (:class:`Params`, :class:`DQNHyper`,
+:class:`DQNSpec`); the checks of a study file are made from those declarations.
+"""
+
+import dataclasses
+import difflib
+import math
+from typing import Annotated, Any, Literal
+
+import pydantic
+from pydantic import BaseModel, ConfigDict, Field, create_model
+
+from uavmec_jax.learning.dqn import DQNHyper, DQNSpec
+from uavmec_jax.world.params import Params
+from uavmec_jax.world.rewards import DEFAULT_REWARD, LOG_GUARDS, REWARDS, TERMS
+
+
+class StudyError(ValueError):
+    """A study, a run folder or an option is not usable; the message is one line for the user."""
+
+
+class Strict(BaseModel):
+    """No unknown keys, no coercion between types, no NaN or infinity unless a field allows it."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+def _field(field: dataclasses.Field) -> Any:
+    """Type and bounds of one setting, from its default and its metadata."""
+    default, bounds = field.default, {k: v for k, v in field.metadata.items() if k in ("gt", "ge", "lt", "le")}
+    if isinstance(default, bool):
+        return bool, default
+    if isinstance(default, int):
+        return Annotated[int, Field(**{"ge": 0, **bounds})], default
+    if isinstance(default, float):
+        infinite = math.isinf(default)
+        return Annotated[float, Field(**{**({"ge": 0} if not bounds else {}), **bounds}, allow_inf_nan=infinite)], default
+    if field.name == "hidden":
+        return tuple[Annotated[int, Field(ge=1, le=4096)], ...], default
+    return tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]], default
+
+
+def _model(name: str, *declarations: type, leave_out: tuple[str, ...] = ()) -> Any:
+    fields = {
+        field.name: _field(field)
+        for declaration in declarations
+        for field in dataclasses.fields(declaration)
+        if field.name not in leave_out
+    }
+    return create_model(name, __base__=Strict, **fields)
+
+
+DQNSettings: Any = _model("DQNSettings", DQNHyper, DQNSpec, leave_out=("total_steps", "n_devices", "max_age"))
+ParamsSettings: Any = _model("ParamsSettings", Params)
+
+TRACED = tuple(field.name for field in dataclasses.fields(DQNHyper))
+"""Hyperparameters that may be axes of a study."""
+
+TRACED_PARAMS = tuple(field.name for field in dataclasses.fields(Params) if isinstance(field.default, int | float))
+TRACED_PARAMS = tuple(name for name in TRACED_PARAMS if name != "n_devices")
+"""Scenario parameters that may be axes of a study."""
+
+
+class Evaluation(Strict):
+    """How policies are judged."""
+
+    draws: Annotated[int, Field(ge=1, le=10_000)] = 32
+    """Held-out volume draws per agent; one fixed draw, the same for every agent, is played besides."""
+    validate_every: Annotated[int, Field(ge=1)] = 10_000
+    """Environment steps of one agent between looks at the greedy policy."""
+    validation_draws: Annotated[int, Field(ge=1, le=1000)] = 16
+    baselines: tuple[Literal["stay-put", "random", "round-robin", "oldest-first"], ...] = (
+        "stay-put",
+        "random",
+        "round-robin",
+        "oldest-first",
+    )
+
+
+class Study(Strict):
+    """One study: the product of its axes is the population."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=80)] = "study"
+    description: str = ""
+    algorithm: Literal["dqn"] = "dqn"
+    reward: str | dict[str, float] = DEFAULT_REWARD
+    guard: Literal["clamp", "log1p"] = "clamp"
+    steps: Annotated[int, Field(ge=1)] = 1_000_000
+    """Environment steps of one agent."""
+    axes: dict[str, Any]
+    """``powered``, ``connected``, ``seeds`` (a number or a list), ``reward``, ``guard``, any traced setting."""
+    dqn: DQNSettings = DQNSettings()
+    params: ParamsSettings = ParamsSettings()
+    evaluation: Evaluation = Evaluation()
+
+    @pydantic.model_validator(mode="after")
+    def _check(self) -> "Study":
+        _check_reward("reward", self.reward)
+        _check_axes(self)
+        for low_high in ("device_battery_range_j", "task_volume_range_bytes"):
+            low, high = getattr(self.params, low_high)
+            if not 0 < low <= high:
+                raise ValueError(f"params.{low_high} is {[low, high]}; give [low, high] with 0 < low <= high")
+        return self
+
+
+def _check_reward(where: str, reward: Any) -> None:
+    if isinstance(reward, str):
+        if reward not in REWARDS:
+            raise ValueError(f"{where} is {reward!r}, which is not a reward; {nearest(reward, REWARDS)}")
+    else:
+        for term in reward:
+            if term not in TERMS:
+                raise ValueError(f"{where} has the term {term!r}, which is not one; {nearest(term, TERMS)}")
+
+
+def _check_axes(study: Study) -> None:
+    """Every axis is known, not empty, without repeats, and its values would be valid settings themselves."""
+    known = ("powered", "connected", "seeds", "reward", "guard", *TRACED, *TRACED_PARAMS)
+    for name in ("powered", "connected", "seeds"):
+        if name not in study.axes:
+            raise ValueError(f"axes.{name} is missing; give a list of whole numbers")
+    for name, values in study.axes.items():
+        where = f"axes.{name}"
+        if name not in known:
+            raise ValueError(f"{where} is not an axis; {nearest(name, known)}")
+        if name == "seeds" and isinstance(values, int) and not isinstance(values, bool):
+            if values < 1:
+                raise ValueError(f"{where} is {values}; give at least 1 seed")
+            continue
+        if not isinstance(values, list):
+            raise ValueError(f"{where} is {values!r}; give a list{' or a number' * (name == 'seeds')}")
+        if not values:
+            raise ValueError(f"{where} is empty; give at least one value")
+        if len(set(values)) < len(values):
+            raise ValueError(f"{where} repeats a value: {values}")
+        for value in values:
+            _check_value(study, name, where, value)
+
+
+def _check_value(study: Study, name: str, where: str, value: Any) -> None:
+    n = study.params.n_devices
+    whole = isinstance(value, int) and not isinstance(value, bool)
+    if name in ("powered", "connected"):
+        if not whole or not 0 <= value <= n:
+            raise ValueError(f"{where} has {value!r}; give whole numbers from 0 to {n}, the number of devices")
+    elif name == "seeds":
+        if not whole or not 0 <= value < 2**31:
+            raise ValueError(f"{where} has {value!r}; give whole numbers from 0 to 2147483647")
+    elif name == "reward":
+        _check_reward(where, value if isinstance(value, str) else str(value))
+    elif name == "guard":
+        if value not in LOG_GUARDS:
+            raise ValueError(f"{where} has {value!r}; {nearest(str(value), LOG_GUARDS)}")
+    else:
+        settings = DQNSettings if name in TRACED else ParamsSettings
+        try:
+            settings(**{name: value})
+        except pydantic.ValidationError as error:
+            raise ValueError(f"{where} has {value!r}; {_wanted(error.errors()[0])}") from None
+
+
+def nearest(word: str, words: Any) -> str:
+    """A hint: the nearest of the known words, or all of them."""
+    close = difflib.get_close_matches(word, list(words), n=1, cutoff=0.4)
+    return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(words)}"
+
+
+def _wanted(error: Any) -> str:
+    message: str = error["msg"]
+    return message.replace("Input should be", "it should be").replace("Value error, ", "")
+
+
+def one_line(source: str, error: pydantic.ValidationError) -> str:
+    """The first problem as one line: file, field, value, and what would be right."""
+    first = error.errors()[0]
+    place = ".".join(str(part) for part in first["loc"] if part not in ("int", "str", "float", "bool"))
+    if first["type"] == "value_error":
+        return f"{source}: {_wanted(first)}"
+    if first["type"] == "extra_forbidden":
+        parent: Any = Study
+        for part in first["loc"][:-1]:
+            parent = parent.model_fields[part].annotation if part in getattr(parent, "model_fields", {}) else None
+        known = getattr(parent, "model_fields", {})
+        return f"{source}: {place} is not a setting; {nearest(str(first['loc'][-1]), known)}"
+    if first["type"] == "missing":
+        return f"{source}: {place} is missing"
+    return f"{source}: {place} is {first['input']!r}; {_wanted(first)}"

@@ -1,0 +1,60 @@
+"""How fast the environment is on this machine."""
+
+import time
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+
+from uavmec_jax.world.environment import Scenario, advance, draw_volumes, make_scenario
+from uavmec_jax.world.layout import sample_layout
+from uavmec_jax.world.params import Params
+from uavmec_jax.world.physics import Cause, State, initial_state
+
+
+def random_steps(scenario: Scenario, state: State, key: Any, steps: Any) -> tuple[State, Any]:
+    """Play ``steps`` random slots in one scenario with auto-reset; returns the state and the summed reward."""
+    n = scenario.layout.capacity.shape[0]
+
+    def step(i: Any, carry: tuple[State, Any]) -> tuple[State, Any]:
+        state, total = carry
+        uniform = jax.random.uniform(jax.random.fold_in(key, i), (n + 1,))
+        action = jnp.minimum((uniform[n] * n).astype(jnp.int32), n - 1)
+        after, reward, outcome = advance(scenario, state, action, draw_volumes(scenario.params, uniform[:n]))
+        fresh = initial_state(scenario.params, scenario.layout)
+        ended = outcome.cause != Cause.NONE
+        return jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, after), total + reward
+
+    return jax.lax.fori_loop(0, steps, step, (state, jnp.float32(0)))
+
+
+def environment_speed(n_layouts: int = 4096, seconds: float = 2.0) -> float:
+    """Environment steps per second with random actions, ``n_layouts`` layouts split over all devices."""
+    devices = jax.local_devices()
+    n_layouts = -(-n_layouts // len(devices)) * len(devices)
+    mesh = Mesh(np.array(devices), ("layouts",))
+    keys = jax.random.split(jax.random.key(0), n_layouts)
+    scenarios = jax.vmap(lambda key: make_scenario(sample_layout(key, Params(), 8, 8)))(keys)
+    states = jax.vmap(lambda s: initial_state(s.params, s.layout))(scenarios)
+    split = PartitionSpec("layouts")
+    play = jax.jit(
+        jax.shard_map(
+            jax.vmap(random_steps, in_axes=(0, 0, 0, None)),
+            mesh=mesh,
+            in_specs=(split, split, split, PartitionSpec()),
+            out_specs=split,
+            check_vma=False,
+        ),
+        donate_argnums=1,
+    )
+    run = partial(play, scenarios)
+    states, _ = jax.block_until_ready(run(states, keys, 1))
+    chunk, best, deadline = max(1, 400_000 // n_layouts), 0.0, time.perf_counter() + seconds
+    while time.perf_counter() < deadline:
+        tick = time.perf_counter()
+        states, _ = jax.block_until_ready(run(states, keys, chunk))
+        best = max(best, n_layouts * chunk / (time.perf_counter() - tick))
+    return best

@@ -1,0 +1,214 @@
+"""Studies: read, check and change study files, and make the population that a study describes."""
+
+import dataclasses
+import itertools
+import math
+import tomllib
+from collections.abc import Iterable, Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pydantic
+import tomli_w
+
+from uavmec_jax.learning import dqn
+from uavmec_jax.learning.algorithm import Agent, Algorithm
+from uavmec_jax.studies.schema import TRACED, Study, StudyError, nearest, one_line
+from uavmec_jax.world.environment import Scenario
+from uavmec_jax.world.layout import sample_layout
+from uavmec_jax.world.params import Params
+from uavmec_jax.world.rewards import make_reward
+
+# Streams of randomness: the seed of the root key. An agent's share of each hangs on its identity.
+_LAYOUT, _TRAINING, _VALIDATION, _HELD_OUT, _FIXED = range(5)
+
+_LIBRARY = resources.files("uavmec_jax.studies") / "library"
+
+
+def shipped() -> dict[str, Any]:
+    """Studies inside the package: name -> file."""
+    return {Path(file.name).stem: file for file in _LIBRARY.iterdir() if file.name.endswith(".toml")}
+
+
+def load_study(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> Study:
+    """Read a study that ships with the package, or a file, and apply overrides.
+
+    Args:
+        name_or_path: ``"table5"``, or the path of a ``.toml`` file.
+        overrides: dotted names to values, e.g. ``{"steps": 20000, "axes.seeds": 3, "dqn.gamma": 0.99}``.
+
+    Raises:
+        StudyError: the file is missing, is not TOML, or holds something that does not fit; one line.
+    """
+    library = shipped()
+    if str(name_or_path) in library:
+        source, text = str(name_or_path), library[str(name_or_path)].read_text(encoding="utf-8")
+    else:
+        path = Path(name_or_path)
+        source = str(path)
+        if not path.is_file():
+            hint = nearest(path.stem, library) if path.suffix != ".toml" else "no such file"
+            raise StudyError(f"{source}: neither a study file nor a shipped study; {hint}")
+        try:
+            text = path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise StudyError(f"{source}: cannot be read: {error}") from None
+    return parse_study(text, source, overrides)
+
+
+def parse_study(text: str, source: str, overrides: Mapping[str, Any] | None = None) -> Study:
+    """A checked :class:`Study` from TOML text; ``source`` names it in messages.
+
+    Raises:
+        StudyError: as :func:`load_study`.
+    """
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise StudyError(f"{source}: not TOML: {error}") from None
+    for dotted, value in (overrides or {}).items():
+        *parents, last = dotted.split(".")
+        place = data
+        for parent in parents:
+            place = place.setdefault(parent, {})
+            if not isinstance(place, dict):
+                raise StudyError(f"{source}: {dotted} cannot be set: {parent} is not a table")
+        place[last] = value
+    data.setdefault("name", Path(source).stem)
+    try:
+        return Study.model_validate(_listed(data))
+    except pydantic.ValidationError as error:
+        raise StudyError(one_line(source, error)) from None
+
+
+def _listed(data: dict[str, Any]) -> dict[str, Any]:
+    """TOML arrays as tuples where a setting is a tuple (the checks do not convert)."""
+
+    def convert(table: Any) -> Any:
+        if not isinstance(table, dict):
+            return table
+        return {key: tuple(value) if isinstance(value, list) else value for key, value in table.items()}
+
+    return {key: convert(value) if key in ("dqn", "params", "evaluation") else value for key, value in data.items()}
+
+
+def study_toml(study: Study) -> str:
+    """The study, every setting resolved, as TOML that :func:`load_study` reads back to an equal study."""
+    return tomli_w.dumps(study.model_dump(mode="json") | {"params": _finite(study.params.model_dump())})
+
+
+def _finite(params: dict[str, Any]) -> dict[str, Any]:
+    """TOML knows infinity, JSON does not: take the plain values."""
+    return {key: list(value) if isinstance(value, tuple) else value for key, value in params.items()}
+
+
+def seeds_of(study: Study) -> list[int]:
+    """The seeds as a list."""
+    seeds = study.axes["seeds"]
+    return list(range(seeds)) if isinstance(seeds, int) else list(seeds)
+
+
+def cell_axes(study: Study) -> list[str]:
+    """The axes that make a cell: all but the seeds, ``powered`` and ``connected`` first."""
+    others = [name for name in study.axes if name not in ("powered", "connected", "seeds")]
+    return ["powered", "connected", *others]
+
+
+def identities(study: Study) -> list[dict[str, Any]]:
+    """One dictionary per agent: its value on every axis. Seeds outermost, so that early blocks hold whole grids."""
+    names = ["seed", *cell_axes(study)]
+    axes: list[Iterable[Any]] = [seeds_of(study), *(study.axes[name] for name in names[1:])]
+    return [dict(zip(names, values, strict=True)) for values in itertools.product(*axes)]
+
+
+def n_agents(study: Study) -> int:
+    """Size of the population, without making it."""
+    lengths = [len(values) for values in study.axes.values() if isinstance(values, list)]
+    seeds = study.axes["seeds"]
+    return math.prod(lengths) * (seeds if isinstance(seeds, int) else 1)
+
+
+def make_algorithm(study: Study) -> Algorithm:
+    """The study's algorithm with its static settings."""
+    names = {field.name for field in dataclasses.fields(dqn.DQNSpec)}
+    settings = {name: value for name, value in study.dqn.model_dump().items() if name in names}
+    limits = study.axes.get("data_age_limit_slots", [study.params.data_age_limit_slots])
+    return dqn.algorithm(
+        dqn.DQNSpec(
+            total_steps=study.steps,
+            n_devices=study.params.n_devices,
+            max_age=max(limits) + 1,
+            **settings,
+        )
+    )
+
+
+def make_agents(study: Study) -> Agent:
+    """The population, leaves ``[A, ...]``, in the order of :func:`identities`.
+
+    What is random about an agent hangs on its seed and its counts of devices alone: layouts on the seed (the cells of
+    one seed are the same town with less and less power and communication), exploration and weights on all three.
+    Hyperparameters and rewards are thus compared on equal ground.
+    """
+    who = identities(study)
+    seeds, powered, connected = (_column(who, name) for name in ("seed", "powered", "connected"))
+
+    def leaf(name: str, default: Any) -> Any:
+        values = [agent.get(name, default) for agent in who]
+        return jnp.asarray(values, jnp.int32 if isinstance(default, int) and not isinstance(default, bool) else None)
+
+    params = Params(
+        **{
+            name: tuple(jnp.full(len(who), part, jnp.float32) for part in value)
+            if isinstance(value, tuple)
+            else (value if name == "n_devices" else leaf(name, value))
+            for name, value in study.params.model_dump().items()
+        }
+    )
+    make_layout = lambda seed, p, on, online: sample_layout(jax.random.fold_in(jax.random.key(_LAYOUT), seed), p, on, online)  # noqa: E731
+    layout = jax.jit(jax.vmap(make_layout))(seeds, params, powered, connected)
+    rewards = [make_reward(agent.get("reward", study.reward), agent.get("guard", study.guard)) for agent in who]
+    reward = jax.tree.map(lambda *leaves: jnp.stack(leaves), *rewards)
+    hyper = dqn.DQNHyper(**{name: leaf(name, getattr(study.dqn, name)) for name in TRACED})
+    return Agent(
+        key=_agent_keys(_TRAINING, seeds, powered, connected),
+        scenario=Scenario(params=params, layout=layout, reward=reward),
+        hyper=hyper,
+    )
+
+
+def validation_keys(study: Study) -> Any:
+    """``[A, validation_draws]`` volume draws for the looks during training."""
+    return _draw_keys(study, _VALIDATION, study.evaluation.validation_draws)
+
+
+def evaluation_keys(study: Study) -> Any:
+    """``[A, draws + 1]`` volume draws for the tables; the last one is the fixed draw, the same for every agent."""
+    held_out = _draw_keys(study, _HELD_OUT, study.evaluation.draws)
+    fixed = jnp.broadcast_to(jax.random.key(_FIXED), (held_out.shape[0], 1))
+    return jnp.concatenate([held_out, fixed], axis=1)
+
+
+def _draw_keys(study: Study, stream: int, draws: int) -> Any:
+    who = identities(study)
+    keys = _agent_keys(stream, *(_column(who, name) for name in ("seed", "powered", "connected")))
+    return jax.jit(jax.vmap(lambda key: jax.random.split(key, draws)))(keys)
+
+
+@jax.jit
+def _fold(root: Any, *numbers: Any) -> Any:
+    for number in numbers:
+        root = jax.random.fold_in(root, number)
+    return root
+
+
+def _agent_keys(stream: int, *numbers: Any) -> Any:
+    return jax.vmap(_fold, (None, *(0 for _ in numbers)))(jax.random.key(stream), *numbers)
+
+
+def _column(who: list[dict[str, Any]], name: str) -> np.ndarray:
+    return np.array([agent[name] for agent in who], np.int32)
