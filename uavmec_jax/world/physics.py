@@ -1,6 +1,7 @@
 """One time slot of the network: a pure function of explicit task volumes (paper, sections 3.1 and 4)."""
 
 import enum
+import math
 from typing import Any
 
 import jax.numpy as jnp
@@ -76,9 +77,12 @@ def initial_state(params: Params, layout: Layout) -> State:
 
 def upload_rate(params: Params, slant_distance_m: Float[Array, " n"]) -> Float[Array, " n"]:
     """Shannon rate of an upload to the UAV, bit/s (paper, equation 4); every served device has the full band."""
-    gain = params.reference_gain * slant_distance_m ** (-jnp.asarray(params.path_loss_exponent, jnp.float32))
+    gain = params.reference_gain * jnp.exp(-params.path_loss_exponent * jnp.log(slant_distance_m))
     snr = params.transmit_power_w * gain / params.noise_power_w
-    return params.bandwidth_hz * jnp.log1p(snr) / jnp.log(2.0)
+    # log1p(snr) as Kahan computes it: as accurate, and XLA's own costs as much as the rest of the slot.
+    one_plus = 1.0 + snr
+    log1p = jnp.where(one_plus == 1.0, snr, jnp.log(one_plus) * (snr / (one_plus - 1.0)))
+    return params.bandwidth_hz * log1p / math.log(2.0)
 
 
 def transition(
