@@ -13,7 +13,7 @@ from uavmec_jax.world.physics import Cause, State, initial_state
 
 
 class SingleScenario(gymnasium.Env):
-    """The paper's environment on one layout: observation f32 ``[2n]``, actions ``0..n-1``; volumes from NumPy's generator."""
+    """The environment on one layout: observation f32 ``[2n]``, actions ``0..n-1``, volumes from NumPy's generator."""
 
     def __init__(self, scenario: Scenario) -> None:
         n = scenario.layout.capacity.shape[0]

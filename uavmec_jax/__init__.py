@@ -1,1 +1,8 @@
-"""x"""
+"""Which device should a rescue UAV serve next? A fast, exact JAX instrument for UAV-assisted edge computing.
+
+``import uavmec_jax as um`` is immediate: jax is imported when a name is first used. ``__init__.pyi`` lists the names.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -28,7 +28,9 @@ def main() -> None:
 @click.argument("study")
 @click.option("--seeds", type=int, help="Number of seeds (axes.seeds).")
 @click.option("--steps", type=int, help="Environment steps of one agent.")
-@click.option("--quick", is_flag=True, help=f"{QUICK_SEEDS} seeds x {QUICK_STEPS:,} steps: a first look within a minute.")
+@click.option(
+    "--quick", is_flag=True, help=f"{QUICK_SEEDS} seeds x {QUICK_STEPS:,} steps: a first look within a minute."
+)
 @click.option(
     "--set",
     "settings",
@@ -145,7 +147,11 @@ def doctor(as_json: bool) -> None:
             value = ", ".join(f"{key} {version}" for key, version in value.items())
         elif isinstance(value, list):
             value = ", ".join(value)
-        click.echo(f"{name.replace('_', ' '):>30}  {value:,}" if isinstance(value, int) else f"{name.replace('_', ' '):>30}  {value}")
+        click.echo(
+            f"{name.replace('_', ' '):>30}  {value:,}"
+            if isinstance(value, int)
+            else f"{name.replace('_', ' '):>30}  {value}"
+        )
 
 
 def _setting(text: str) -> tuple[str, Any]:

@@ -5,7 +5,8 @@ environment steps and one gradient step. The population (:mod:`uavmec_jax.learni
 ``vmap``: the iteration number is shared by all agents and never batched, everything of one agent is.
 """
 
-from dataclasses import dataclass, field
+import itertools
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -13,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
-from jaxtyping import Array, Float, Int, UInt
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, UInt
 
 from uavmec_jax.learning import replay
 from uavmec_jax.learning.algorithm import AGENTS_AXIS, Agent, Algorithm
@@ -24,7 +25,6 @@ from uavmec_jax.world.layout import Layout
 from uavmec_jax.world.params import Params
 from uavmec_jax.world.physics import Cause, State, initial_state
 from uavmec_jax.world.rollout import Policy
-
 
 _WEIGHTS_STREAM = 2**32 - 1
 """``fold_in`` number of the initial weights; the iterations use their own numbers, from 0."""
@@ -89,7 +89,7 @@ class DQNSpec:
     def agent_bytes(self) -> int:
         """Memory of one agent in training, bytes: replay, weights, target, moments, gradient, best weights."""
         widths = (2 * self.n_devices, *self.hidden, self.n_devices)
-        weights = sum((i + 1) * o for i, o in zip(widths, widths[1:], strict=False))
+        weights = sum((i + 1) * o for i, o in itertools.pairwise(widths))
         return self.replay.bytes + 6 * 4 * weights
 
 
@@ -152,7 +152,7 @@ def init(spec: DQNSpec, agent: Agent) -> DQNState:
 
 def update(spec: DQNSpec, agent: Agent, state: DQNState, first: Any, last: Any) -> DQNState:
     """Advance one agent by the iterations ``first <= i < last`` (shared scalars, traced); run under ``vmap``."""
-    state = state.replace(episode_slots=jnp.int32(0), episodes=jnp.int32(0))
+    state = replace(state, episode_slots=jnp.int32(0), episodes=jnp.int32(0))
     return jax.lax.fori_loop(first, last, lambda i, carry: _iteration(spec, agent, carry, i), state)
 
 
@@ -163,7 +163,7 @@ def epsilon(hyper: DQNHyper, total_steps: int, steps_done: Any) -> Float[Array, 
     return hyper.exploration_initial_eps + done * (hyper.exploration_final_eps - hyper.exploration_initial_eps)
 
 
-def gradient_steps(spec: DQNSpec, hyper: DQNHyper, steps_done: Any) -> Int[Array, ""]:
+def gradient_steps(spec: DQNSpec, hyper: DQNHyper, steps_done: Any) -> Int[ArrayLike, ""]:
     """Gradient steps made once the iteration that ends at ``steps_done`` is through; 0 during the warm-up.
 
     The first falls at the first whole iteration that ends after ``learning_starts`` steps (step 104 in the paper).
@@ -171,7 +171,7 @@ def gradient_steps(spec: DQNSpec, hyper: DQNHyper, steps_done: Any) -> Int[Array
     return jnp.maximum(steps_done // spec.train_frequency - hyper.learning_starts // spec.train_frequency, 0)
 
 
-def target_is_due(spec: DQNSpec, hyper: DQNHyper, steps_done: Any) -> Array:
+def target_is_due(spec: DQNSpec, hyper: DQNHyper, steps_done: Any) -> Bool[ArrayLike, ""]:
     """Whether a multiple of the target interval lies in the iteration that ends at ``steps_done``."""
     return steps_done // hyper.target_interval > (steps_done - spec.train_frequency) // hyper.target_interval
 
@@ -180,7 +180,8 @@ def q_values(spec: DQNSpec, hyper: DQNHyper, weights: Any, observation: Float[Ar
     """Q-values ``[..., n]``; the ages are scaled as the agent's hyperparameters say."""
     n = spec.n_devices
     scale = jnp.where(jnp.arange(2 * n) < n, 1.0, hyper.age_scale)
-    return spec.network.apply(weights, observation * scale)
+    values: Any = spec.network.apply(weights, observation * scale)
+    return values
 
 
 def policy(spec: DQNSpec, hyper: DQNHyper, weights: Any) -> Policy:
@@ -226,7 +227,7 @@ def _iteration(spec: DQNSpec, agent: Agent, state: DQNState, i: Int[Array, ""]) 
         lambda: state.target,
     )
     batch = replay.sample(spec.replay, rows, steps_done, bits[n_acting:])
-    return _learn(spec, agent.hyper, state.replace(rows=rows, target=target), batch, steps_done)
+    return _learn(spec, agent.hyper, replace(state, rows=rows, target=target), batch, steps_done)
 
 
 def _act(
@@ -246,7 +247,8 @@ def _act(
     ended = terminated | is_truncated(scenario, after, outcome)
     row = replay.pack(spec.replay, action, reward, after.battery / layout.capacity, after.age, terminated, ended)
     fresh = initial_state(scenario.params, layout)
-    state = state.replace(
+    state = replace(
+        state,
         world=jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, after),
         episode_slots=state.episode_slots + jnp.where(ended, after.slot, 0),
         episodes=state.episodes + ended,
@@ -274,7 +276,8 @@ def _learn(spec: DQNSpec, hyper: DQNHyper, state: DQNState, batch: replay.Transi
         count=gradient_steps(spec, hyper, steps_done),
         enabled=learning & ~frozen,
     )
-    return state.replace(
+    return replace(
+        state,
         weights=optax.apply_updates(state.weights, steps),
         moments=moments,
         loss=loss,

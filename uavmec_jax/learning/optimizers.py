@@ -21,7 +21,7 @@ def global_norm(gradients: Any) -> Float[Array, ""]:
 
 
 def clipped_adam() -> optax.GradientTransformationExtraArgs:
-    """Global-norm clipping followed by Adam (b1 0.9, b2 0.999, eps 1e-8), every setting a traced argument of ``update``.
+    """Global-norm clipping, then Adam (b1 0.9, b2 0.999, eps 1e-8), every setting a traced argument of ``update``.
 
     Clipping multiplies by ``min(max_norm / (norm + 1e-6), 1)`` (``torch.nn.utils.clip_grad_norm_``). ``update`` takes
     ``learning_rate``, ``max_norm``, the gradient's ``norm``, ``count`` (this update's number, from 1) and ``enabled``;

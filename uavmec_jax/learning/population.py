@@ -5,6 +5,7 @@ its memory (the replay is what costs) and, on a CPU, for its caches. Within a bl
 local devices, and every device runs the same program without talking to the others.
 """
 
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Key
 
 from uavmec_jax.learning.algorithm import AGENTS_AXIS, Agent, Algorithm
 from uavmec_jax.world.rollout import rollouts
@@ -133,7 +134,7 @@ class Best:
 def train(
     algorithm: Algorithm,
     agents: Agent,
-    validation_keys: PRNGKeyArray,
+    validation_keys: Key[Array, "A D"],
     *,
     validation: Validation,
     blocks: Blocks,
@@ -152,7 +153,7 @@ def train(
     n_agents = validation_keys.shape[0]
     mesh = Mesh(np.array(jax.local_devices()[: blocks.devices]), (AGENTS_AXIS,))
     started = time.perf_counter()
-    programs = _Programs.compile(algorithm, mesh, _take(agents, validation_keys, 0, blocks.size))
+    programs = Programs.compile(algorithm, mesh, _take(agents, validation_keys, 0, blocks.size))
     compile_seconds = time.perf_counter() - started
     for block in range(blocks.count):
         first = block * blocks.size
@@ -170,23 +171,28 @@ def train(
         yield trained
 
 
-def _take(agents: Agent, keys: PRNGKeyArray, first: int, size: int) -> tuple[Agent, PRNGKeyArray]:
+def _take(agents: Agent, keys: Key[Array, "A D"], first: int, size: int) -> tuple[Agent, Key[Array, "B D"]]:
     """``size`` agents from ``first`` on; past the end the last one is repeated, to keep the shape."""
     places = np.minimum(np.arange(first, first + size), keys.shape[0] - 1)
-    taken: tuple[Agent, PRNGKeyArray] = jax.tree.map(lambda leaf: leaf[places], (agents, keys))
+    taken: tuple[Agent, Key[Array, "B D"]] = jax.tree.map(lambda leaf: leaf[places], (agents, keys))
     return taken
 
 
 @dataclass(frozen=True)
-class _Programs:
-    """The compiled programs of one block shape."""
+class Programs:
+    """The compiled programs of one block shape, the agent axis split over the devices of a mesh.
+
+    ``init(agents) -> state``; ``update(agents, state, first, last) -> state``, the old state is given away;
+    ``look(agents, keys, weights, best, step) -> (score [B], best)``, the old best is given away.
+    """
 
     init: Callable
     update: Callable
     look: Callable
 
     @classmethod
-    def compile(cls, algorithm: Algorithm, mesh: Mesh, example: tuple[Agent, PRNGKeyArray]) -> "_Programs":
+    def compile(cls, algorithm: Algorithm, mesh: Mesh, example: tuple[Agent, Key[Array, "B D"]]) -> "Programs":
+        """Compile for blocks like ``example``: the agents and their validation draws."""
         split, shared = PartitionSpec(AGENTS_AXIS), PartitionSpec()
 
         def over_agents(function: Callable, n_split: int, n_shared: int = 0, **jit: Any) -> Any:
@@ -203,7 +209,9 @@ class _Programs:
         state = jax.tree.map(struct_of, jax.eval_shape(init, agents))
         batch = sharding.shard_shape((keys.shape[0],))[0] * mesh.size
         number = jax.ShapeDtypeStruct((batch,), np.float32, sharding=sharding)
-        best = Best(weights=state.weights, score=number, step=jax.ShapeDtypeStruct((batch,), np.int32, sharding=sharding))
+        best = Best(
+            weights=state.weights, score=number, step=jax.ShapeDtypeStruct((batch,), np.int32, sharding=sharding)
+        )
         options = _compiler_options()
         update = over_agents(algorithm.update, 2, 2, donate_argnums=1, compiler_options=options)
         look = over_agents(partial(_look, algorithm), 4, 1, donate_argnums=3)
@@ -219,20 +227,22 @@ def _compiler_options() -> dict[str, bool]:
     return {"xla_cpu_enable_concurrency_optimized_scheduler": False} if jax.default_backend() == "cpu" else {}
 
 
-def _look(algorithm: Algorithm, agent: Agent, keys: PRNGKeyArray, weights: Any, best: Best, step: Any) -> Any:
+def _look(algorithm: Algorithm, agent: Agent, keys: Key[Array, "B D"], weights: Any, best: Best, step: Any) -> Any:
     """Mean validation lifetime of the greedy policy of one agent, and the best so far (ties keep the earlier)."""
     scenario = agent.scenario
     policy = algorithm.policy(agent.hyper, weights)
     score = jnp.mean(rollouts(policy, scenario.params, scenario.layout, keys).length.astype(jnp.float32))
     better = score > best.score
-    kept = jax.tree.map(lambda new, old: jnp.where(better, new, old), (weights, score, step), (best.weights, best.score, best.step))
+    kept = jax.tree.map(
+        lambda new, old: jnp.where(better, new, old), (weights, score, step), (best.weights, best.score, best.step)
+    )
     return score, Best(*kept)
 
 
 def _train_block(
     algorithm: Algorithm,
-    programs: _Programs,
-    members: tuple[Agent, PRNGKeyArray],
+    programs: Programs,
+    members: tuple[Agent, Key[Array, "B D"]],
     validation: Validation,
     agents: slice,
     report: Callable[[int, float], None],
@@ -276,7 +286,9 @@ def _train_block(
         best_score=keep(best.score),
         diverged_at=keep(state.diverged_at),
         chunk_steps=np.array(chunk_ends),
-        episode_length=np.where(counts > 0, np.stack(slots, 1)[:real] / np.maximum(counts, 1), np.nan).astype(np.float32),
+        episode_length=np.where(counts > 0, np.stack(slots, 1)[:real] / np.maximum(counts, 1), np.nan).astype(
+            np.float32
+        ),
         look_steps=np.array(look_ends),
         validation=np.stack(scores, 1)[:real],
         seconds=seconds,
@@ -289,5 +301,5 @@ def _chunks(algorithm: Algorithm, validation: Validation) -> Iterator[tuple[int,
     for start in range(0, algorithm.iterations, every):
         stop = min(start + every, algorithm.iterations)
         edges = np.linspace(start, stop, min(validation.chunks, stop - start) + 1).astype(int)
-        for first, last in zip(edges[:-1], edges[1:], strict=True):
+        for first, last in itertools.pairwise(edges):
             yield int(first), int(last), last == stop

@@ -79,7 +79,7 @@ class ReplaySpec:
 
 
 def init(spec: ReplaySpec) -> UInt[Array, "rows words"]:
-    """An empty memory ``[ring + 1, words]``; row 0 stands before the first transition and says an episode ended there."""
+    """An empty memory ``[ring + 1, words]``; row 0 stands before the first transition: an episode ended there."""
     rows = jnp.zeros((spec.ring + 1, spec.words), jnp.uint32)
     return rows.at[0, -1].set(_ENDED)
 

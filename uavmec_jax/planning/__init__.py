@@ -1,1 +1,1 @@
-"""x"""
+"""Policies that learn nothing: baselines, planners, bounds."""

@@ -1,1 +1,1 @@
-"""x"""
+"""Tables and figures, from results alone."""

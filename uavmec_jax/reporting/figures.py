@@ -44,7 +44,9 @@ def grid_figure(results: Results) -> Figure:
     panels = [(name, title) for name, title in PANELS if name in cells]
     figure = new_figure(3.3 * (len(panels) + 1), 3.6)
     axes = figure.subplots(1, len(panels) + 1, sharey=True, squeeze=False)[0]
-    paper = cells.assign(paper=[TABLE5.get((p, c), np.nan) for p, c in zip(cells.powered, cells.connected, strict=True)])
+    paper = cells.assign(
+        paper=[TABLE5.get((p, c), np.nan) for p, c in zip(cells.powered, cells.connected, strict=True)]
+    )
     limits = (10.0, max(33.0, float(cells[[name for name, _ in panels]].max().max())))
     for axis, (name, title) in zip(axes, [*panels, ("paper", "the paper, Table 5")], strict=True):
         image = _heat_map(axis, paper.pivot(index="powered", columns="connected", values=name), limits)
@@ -76,7 +78,10 @@ def curves_figure(results: Results) -> Figure:
     """Training curves: episode length while exploring, and the greedy policy on validation draws, for every agent."""
     figure = new_figure(9, 3.6)
     left, right = figure.subplots(1, 2, sharey=True)
-    pairs = ((left, "chunk_steps", "episode_length", "while training"), (right, "look_steps", "validation", "greedy policy"))
+    pairs = (
+        (left, "chunk_steps", "episode_length", "while training"),
+        (right, "look_steps", "validation", "greedy policy"),
+    )
     for axis, steps, values, title in pairs:
         axis.plot(results.curves[steps], results.curves[values].T, lw=0.6, alpha=0.35, color="tab:blue")
         axis.plot(results.curves[steps], np.nanmean(results.curves[values], axis=0), lw=2, color="tab:orange")

@@ -28,10 +28,9 @@ def tables(results: Results) -> list[Table]:
 
 
 def grid_table(results: Results, cells: pd.DataFrame, policy: str) -> Table:
-    """Lifetimes in slots: ours +- half the 95 % interval / paper / oldest-first."""
+    """Lifetimes in slots: ours +- half the 95 % interval, below it the paper's / oldest-first's."""
     baseline = "oldest_first" if "oldest_first" in results.policies else None
-    parts = ["ours ± 95 %", "paper", *(["oldest-first"] if baseline else [])]
-    title = f"Lifetime in slots, `{policy}` weights: {' / '.join(parts)}"
+    title = f"Lifetime in slots, `{policy}` weights ± 95 %; below: paper{' / oldest-first' * bool(baseline)}"
     return _grid(cells, title, lambda cell: _lifetime(cell, policy, baseline))
 
 
@@ -40,7 +39,7 @@ def _lifetime(cell: Any, policy: str, baseline: str | None) -> Text:
     text = Text(f"{cell[policy]:.1f}", style=_style(cell[policy], paper))
     half = (cell[f"{policy}_high"] - cell[f"{policy}_low"]) / 2
     text.append(f" ±{half:.1f}" if half == half else " ±?", style="dim")
-    text.append(f" / {paper:g}" if paper is not None else " / -", style="not bold default")
+    text.append(f"\n{paper:g}" if paper is not None else "\n-", style="not bold default")
     if baseline:
         text.append(f" / {cell[baseline]:.1f}", style="not bold default")
     return text
@@ -56,19 +55,20 @@ def failure_table(cells: pd.DataFrame) -> Table:
     """The device that fails first most often under the best weights, and in what share of the episodes."""
 
     def first(cell: Any) -> Text:
-        if not cell["best_first_device"]:
-            return Text("UAV", style="dim")
-        return Text(f"#{cell['best_first_device']}", style="bold").append(
-            f" {cell['best_first_share']:.0%}", style="not bold dim"
-        )
+        text = Text(_first(cell), style="bold" if cell["best_first_device"] else "dim")
+        return text.append(f" {cell['best_first_share']:.0%}" * bool(cell["best_first_device"]), style="not bold dim")
 
-    return _grid(cells, "First to fail: device number, share of the held-out episodes (all seeds together)", first)
+    return _grid(cells, "First to fail: device, share of held-out episodes (all seeds)", first)
+
+
+def _first(cell: Any) -> str:
+    return f"#{int(cell['best_first_device'])}" if cell["best_first_device"] else "UAV"
 
 
 def _grid(cells: pd.DataFrame, title: str, content: Any) -> Table:
     table = Table(title=title, title_justify="left", title_style="bold")
     connected = list(dict.fromkeys(cells["connected"]))
-    table.add_column("powered \\ connected", justify="right", style="bold")
+    table.add_column("power\n\\ comms", justify="right", style="bold")
     for count in connected:
         table.add_column(str(count), justify="right", no_wrap=True)
     for powered in dict.fromkeys(cells["powered"]):
@@ -93,8 +93,8 @@ def list_table(results: Results, cells: pd.DataFrame) -> Table:
             half = (cell[f"{policy}_high"] - cell[f"{policy}_low"]) / 2
             shown = policy in ("best", "last") and half == half
             lifetimes.append(f"{cell[policy]:.1f}" + (f" ±{half:.1f}" if shown else ""))
-        first = f"#{cell['best_first_device']} {cell['best_first_share']:.0%}" if cell["best_first_device"] else "UAV"
-        table.add_row(*(f"{cell[name]:g}" if not isinstance(cell[name], str) else cell[name] for name in (*axes, "seeds")), *lifetimes, first)
+        place = [value if isinstance(value := cell[name], str) else f"{value:g}" for name in (*axes, "seeds")]
+        table.add_row(*place, *lifetimes, _first(cell))
     return table
 
 
@@ -105,10 +105,10 @@ def summary(results: Results) -> list[str]:
     lines = [f"Mean over {len(cells)} cells, slots: {means}."]
     if "training_steps_per_second" in run:
         seconds = run["seconds"]
+        spent = ", ".join(f"{name} {seconds[name]:.0f} s" for name in ("compile", "train", "validate", "evaluate"))
         lines.append(
             f"{run['agents_done']} of {run['agents']} agents, {run['environment_steps']:,} environment steps at "
-            f"{run['training_steps_per_second']:,}/s; compile {seconds['compile']:.0f} s, train {seconds['train']:.0f} s, "
-            f"validate {seconds['validate']:.1f} s, evaluate {seconds['evaluate']:.0f} s, in all {seconds['wall']:.0f} s."
+            f"{run['training_steps_per_second']:,}/s; {spent}, in all {seconds['wall']:.0f} s."
         )
     if run.get("diverged"):
         lines.append(f"{run['diverged']} agents diverged and were frozen; column diverged_at of agents.csv says when.")

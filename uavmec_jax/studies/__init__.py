@@ -1,1 +1,1 @@
-"""x"""
+"""Studies: what to train, how to judge it, and what is kept of it."""

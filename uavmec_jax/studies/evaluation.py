@@ -6,7 +6,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Key
 
 from uavmec_jax.learning.algorithm import Agent, Algorithm
 from uavmec_jax.planning.heuristics import HEURISTICS
@@ -66,7 +66,7 @@ def _device(share: np.ndarray) -> int:
 def judge(
     algorithm: Algorithm,
     agents: Agent,
-    keys: PRNGKeyArray,
+    keys: Key[Array, "A D"],
     weights: Mapping[str, Any],
     baselines: Iterable[str],
 ) -> dict[str, Judgement]:
@@ -81,8 +81,8 @@ def judge(
     """
 
     @jax.jit
-    def play_learned(agents: Agent, keys: PRNGKeyArray, weights: Any) -> Episode:
-        def one(agent: Agent, draws: PRNGKeyArray, weights: Any) -> Episode:
+    def play_learned(agents: Agent, keys: Key[Array, "A D"], weights: Any) -> Episode:
+        def one(agent: Agent, draws: Key[Array, " D"], weights: Any) -> Episode:
             policy = algorithm.policy(agent.hyper, weights)
             return rollouts(policy, agent.scenario.params, agent.scenario.layout, draws)
 
@@ -91,8 +91,8 @@ def judge(
     names = tuple(baselines)
 
     @jax.jit
-    def play_baselines(agents: Agent, keys: PRNGKeyArray) -> dict[str, Episode]:
-        def one(agent: Agent, draws: PRNGKeyArray) -> dict[str, Episode]:
+    def play_baselines(agents: Agent, keys: Key[Array, "A D"]) -> dict[str, Episode]:
+        def one(agent: Agent, draws: Key[Array, " D"]) -> dict[str, Episode]:
             world = (agent.scenario.params, agent.scenario.layout, draws)
             return {name: rollouts(HEURISTICS[name], *world) for name in names}
 

@@ -5,6 +5,7 @@ import os
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
@@ -80,9 +81,11 @@ class Results:
         """Write every file of the run into ``directory``, each atomically; ``run.json`` last."""
         directory.mkdir(parents=True, exist_ok=True)
         _write(directory / _STUDY, lambda file: file.write(study_toml(self.study).encode()))
-        _write(directory / _AGENTS, lambda file: file.write(self.agents.to_csv(index=False, float_format="%.6g").encode()))
+        _write(
+            directory / _AGENTS, lambda file: file.write(self.agents.to_csv(index=False, float_format="%.6g").encode())
+        )
         for name, arrays in ((_CURVES, self.curves), (_EVALUATION, self.evaluation), (_WEIGHTS, self.weights)):
-            _write(directory / name, lambda file, arrays=arrays: np.savez_compressed(file, **arrays))
+            _write(directory / name, partial(_save_arrays, arrays=arrays))
         _write(directory / _RUN, lambda file: file.write((json.dumps(self.run, indent=1) + "\n").encode()))
 
 
@@ -140,6 +143,10 @@ def load_weights(directory: str | Path, which: str = "best") -> dict[str, Any]:
     if not chosen:
         raise StudyError(f"{Path(directory) / _WEIGHTS}: holds no {which!r} weights; give 'best' or 'last'")
     return traverse_util.unflatten_dict(chosen, sep="/")
+
+
+def _save_arrays(file: IO[bytes], arrays: dict[str, Any]) -> None:
+    np.savez_compressed(file, **arrays)
 
 
 def _load_arrays(path: Path) -> dict[str, np.ndarray]:

@@ -53,9 +53,10 @@ def plan_study(study: Study) -> Plan:
     """
     algorithm, agents, free = make_algorithm(study), n_agents(study), host.free_memory()
     if agents * _BYTES_WITHOUT_TRAINING > free:
+        needed = agents * _BYTES_WITHOUT_TRAINING
         raise StudyError(
-            f"{study.name}: {agents:,} agents need {agents * _BYTES_WITHOUT_TRAINING / 2**30:,.0f} GiB before any of them "
-            f"trains, {free / 2**30:.1f} GiB are free; shorten an axis"
+            f"{study.name}: {agents:,} agents need {needed / 2**30:,.0f} GiB before any of them trains, "
+            f"{free / 2**30:.1f} GiB are free; shorten an axis"
         )
     try:
         blocks = population.plan_blocks(agents, algorithm.agent_bytes, free)
@@ -133,7 +134,9 @@ def run_study(
     return results
 
 
-def _finish(results: Results, algorithm: Algorithm, agents: Agent, keys: Any, block: TrainedBlock, who: pd.DataFrame) -> None:
+def _finish(
+    results: Results, algorithm: Algorithm, agents: Agent, keys: Any, block: TrainedBlock, who: pd.DataFrame
+) -> None:
     """Judge a trained block and add it to the results."""
     members = jax.tree.map(lambda leaf: leaf[block.agents], agents)
     weights = {"best": block.best, "last": block.last}

@@ -36,7 +36,9 @@ def _field(field: dataclasses.Field) -> Any:
         return Annotated[int, Field(**{"ge": 0, **bounds})], default
     if isinstance(default, float):
         infinite = math.isinf(default)
-        return Annotated[float, Field(**{**({"ge": 0} if not bounds else {}), **bounds}, allow_inf_nan=infinite)], default
+        return Annotated[
+            float, Field(**{**({"ge": 0} if not bounds else {}), **bounds}, allow_inf_nan=infinite)
+        ], default
     if field.name == "hidden":
         return tuple[Annotated[int, Field(ge=1, le=4096)], ...], default
     return tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]], default

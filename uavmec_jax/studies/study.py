@@ -19,7 +19,7 @@ from uavmec_jax.learning import dqn
 from uavmec_jax.learning.algorithm import Agent, Algorithm
 from uavmec_jax.studies.schema import TRACED, Study, StudyError, nearest, one_line
 from uavmec_jax.world.environment import Scenario
-from uavmec_jax.world.layout import sample_layout
+from uavmec_jax.world.layout import Layout, sample_layout
 from uavmec_jax.world.params import Params
 from uavmec_jax.world.rewards import make_reward
 
@@ -161,16 +161,17 @@ def make_agents(study: Study) -> Agent:
         values = [agent.get(name, default) for agent in who]
         return jnp.asarray(values, jnp.int32 if isinstance(default, int) and not isinstance(default, bool) else None)
 
-    params = Params(
-        **{
-            name: tuple(jnp.full(len(who), part, jnp.float32) for part in value)
-            if isinstance(value, tuple)
-            else (value if name == "n_devices" else leaf(name, value))
-            for name, value in study.params.model_dump().items()
-        }
-    )
-    make_layout = lambda seed, p, on, online: sample_layout(jax.random.fold_in(jax.random.key(_LAYOUT), seed), p, on, online)  # noqa: E731
-    layout = jax.jit(jax.vmap(make_layout))(seeds, params, powered, connected)
+    def spread(name: str, value: Any) -> Any:
+        if isinstance(value, tuple):
+            return tuple(jnp.full(len(who), part, jnp.float32) for part in value)
+        return value if name == "n_devices" else leaf(name, value)
+
+    def town(seed: Any, params: Params, n_powered: Any, n_connected: Any) -> Layout:
+        return sample_layout(jax.random.fold_in(jax.random.key(_LAYOUT), seed), params, n_powered, n_connected)
+
+    settings: dict[str, Any] = {name: spread(name, value) for name, value in study.params.model_dump().items()}
+    params = Params(**settings)
+    layout = jax.jit(jax.vmap(town))(seeds, params, powered, connected)
     rewards = [make_reward(agent.get("reward", study.reward), agent.get("guard", study.guard)) for agent in who]
     reward = jax.tree.map(lambda *leaves: jnp.stack(leaves), *rewards)
     hyper = dqn.DQNHyper(**{name: leaf(name, getattr(study.dqn, name)) for name in TRACED})

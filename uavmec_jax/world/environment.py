@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
 
 from uavmec_jax.world.layout import Layout, sample_layout
 from uavmec_jax.world.params import Params
@@ -23,9 +23,7 @@ class Scenario:
     reward: Reward
 
 
-def make_scenario(
-    layout: Layout | None = None, params: Params | None = None, reward: Reward | None = None
-) -> Scenario:
+def make_scenario(layout: Layout | None = None, params: Params | None = None, reward: Reward | None = None) -> Scenario:
     """A scenario from its parts; by default a layout of seed 0 with 8 powered and 8 connected devices."""
     params = Params() if params is None else params
     if layout is None:
@@ -46,7 +44,7 @@ def draw_volumes(params: Params, uniform: Float[Array, "*shape"]) -> Float[Array
 
 
 def advance(
-    scenario: Scenario, state: State, action: Int[Array, ""], volumes: Float[Array, " n"]
+    scenario: Scenario, state: State, action: Int[ArrayLike, ""], volumes: Float[Array, " n"]
 ) -> tuple[State, Float[Array, ""], Outcome]:
     """One slot with explicit volumes and no reset: next state, reward, outcome."""
     after, outcome = transition(scenario.params, scenario.layout, state, action, volumes)
@@ -62,7 +60,7 @@ class UavMecEnv:
     """UAV-assisted edge computing as an environment with the signatures of gymnax 1.0.
 
     Observation: f32 ``[2n]``, see :func:`observe`. Action: int in ``[0, n)``, the device to visit.
-    Reward: see :mod:`uavmec_jax.world.rewards`. ``params`` is a :class:`Scenario`; its leaves may be batched by ``vmap``.
+    Reward: see :mod:`uavmec_jax.world.rewards`. ``params`` is a :class:`Scenario`, batched by ``vmap``.
     The state is a :class:`State`; ``step`` resets by itself when an episode ends and then reports the true last
     observation as ``info["final_observation"]``.
     """
@@ -84,7 +82,7 @@ class UavMecEnv:
 
     @partial(jax.jit, static_argnames=("self",))
     def reset(self, key: PRNGKeyArray, params: Scenario | None = None) -> tuple[Array, State]:
-        """Start an episode; returns the observation and the state. (Nothing in it is random: volumes are drawn per slot.)"""
+        """Start an episode: observation and state. Nothing in it is random; volumes are drawn per slot."""
         del key
         scenario = self.default_params if params is None else params
         state = initial_state(scenario.params, scenario.layout)

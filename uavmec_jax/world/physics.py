@@ -2,11 +2,12 @@
 
 import enum
 import math
+from dataclasses import replace
 from typing import Any
 
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int, Num
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
 from uavmec_jax.world.layout import Layout
 from uavmec_jax.world.params import Params
@@ -86,7 +87,7 @@ def upload_rate(params: Params, slant_distance_m: Float[Array, " n"]) -> Float[A
 
 
 def transition(
-    params: Params, layout: Layout, state: State, action: Int[Array, ""], volumes: Num[Array, " n"]
+    params: Params, layout: Layout, state: State, action: Int[ArrayLike, ""], volumes: Num[Array, " n"]
 ) -> tuple[State, Outcome]:
     """Fly to a device, serve everyone in range, let the others compute, and see who is still alive.
 
@@ -128,7 +129,7 @@ def transition(
         uav_energy=state.uav_energy - uav_cost,
         slot=state.slot + 1,
     )
-    unstarted = state.replace(slot=state.slot + jnp.where(params.count_unfinished_slot, 1, 0))
+    unstarted = replace(state, slot=state.slot + jnp.where(params.count_unfinished_slot, 1, 0))
     after = State(
         battery=jnp.where(starts, after.battery, unstarted.battery),
         age=jnp.where(starts, after.age, unstarted.age),

@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from uavmec_jax.world.layout import Layout
 from uavmec_jax.world.physics import State
@@ -94,7 +94,7 @@ def make_reward(reward: str | Mapping[str, float] = DEFAULT_REWARD, guard: str =
 
 
 def reward_terms(
-    layout: Layout, before: State, action: Int[Array, ""], after: State, log1p: Any = False
+    layout: Layout, before: State, action: Int[ArrayLike, ""], after: State, log1p: Any = False
 ) -> Float[Array, "8"]:
     """The eight :data:`TERMS` of one slot, given the states around it."""
     visited_age = before.age[action].astype(jnp.float32)
@@ -108,7 +108,7 @@ def reward_terms(
 
 
 def reward_of(
-    reward: Reward, layout: Layout, before: State, action: Int[Array, ""], after: State
+    reward: Reward, layout: Layout, before: State, action: Int[ArrayLike, ""], after: State
 ) -> Float[Array, ""]:
     """The scalar reward of one slot."""
     return jnp.dot(reward.weights, reward_terms(layout, before, action, after, reward.log1p))

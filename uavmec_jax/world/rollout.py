@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import Array, Key, PRNGKeyArray
 
 from uavmec_jax.world.environment import draw_volumes
 from uavmec_jax.world.layout import Layout
@@ -72,11 +72,9 @@ def rollout(policy: Policy, params: Params, layout: Layout, key: PRNGKeyArray) -
         first_failure=jnp.zeros(n, jnp.float32),
     )
     state, outcome = jax.lax.while_loop(alive, play_slot, (initial_state(params, layout), nothing))
-    return Episode(
-        length=state.slot, cause=outcome.cause, failed=outcome.failed, first_failure=outcome.first_failure
-    )
+    return Episode(length=state.slot, cause=outcome.cause, failed=outcome.failed, first_failure=outcome.first_failure)
 
 
-def rollouts(policy: Policy, params: Params, layout: Layout, keys: PRNGKeyArray) -> Episode:
+def rollouts(policy: Policy, params: Params, layout: Layout, keys: Key[Array, " D"]) -> Episode:
     """Play one episode per volume draw; ``keys`` is ``[D]`` and every field of the result gains a leading ``D``."""
     return jax.vmap(lambda key: rollout(policy, params, layout, key))(keys)

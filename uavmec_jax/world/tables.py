@@ -1,4 +1,4 @@
-"""Hardware of the paper: device types, their standby power (Table 1), active power (Table 2), processing rate (Table 3)."""
+"""Hardware of the paper: device types and their standby power (Table 1), active power (Table 2), rates (Table 3)."""
 
 import numpy as np
 

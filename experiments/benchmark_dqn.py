@@ -1,0 +1,213 @@
+"""Training speed: this package, Stable-Baselines3 on the same environment, and the arithmetic ceiling, in one run.
+
+    uv run --group sb3 python experiments/benchmark_dqn.py --out results/benchmark
+
+Same algorithm for both (batch 16, one gradient step per four environment steps), replay filled with 100,000 transitions
+per agent before the clock starts. Without the `sb3` group the comparison is left out. Prints a table, writes JSON.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+FILLED = 100_000
+AGENTS = (1, 8, 75, 300)
+
+
+def train_speed(n_agents: int, seconds: float) -> dict:
+    """Environment steps/s of training with ``n_agents`` agents on a filled replay."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+    from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+    from uavmec_jax.learning.algorithm import AGENTS_AXIS
+    from uavmec_jax.learning.population import Programs, plan_blocks
+    from uavmec_jax.studies import host
+    from uavmec_jax.studies.study import make_agents, make_algorithm, parse_study, validation_keys
+
+    study = parse_study(
+        f"steps = {2 * FILLED}\n[axes]\npowered = [8]\nconnected = [8]\nseeds = {n_agents}", "benchmark"
+    )
+    algorithm = make_algorithm(study)
+    blocks = plan_blocks(n_agents, algorithm.agent_bytes, host.free_memory())
+    mesh = Mesh(np.array(jax.local_devices()[: blocks.devices]), (AGENTS_AXIS,))
+    population = (make_agents(study), validation_keys(study))
+    take = lambda block: jax.device_put(  # noqa: E731
+        jax.tree.map(
+            lambda leaf: leaf[np.arange(block * blocks.size, (block + 1) * blocks.size) % n_agents], population
+        ),
+        NamedSharding(mesh, PartitionSpec(AGENTS_AXIS)),
+    )
+    tick = time.perf_counter()
+    programs = Programs.compile(algorithm, mesh, take(0))
+    compile_seconds = time.perf_counter() - tick
+    start, played = FILLED // algorithm.steps_per_iteration, 1000
+    fill = jax.jit(
+        lambda rows: rows.at[:, 1 : FILLED + 1].set(
+            jnp.tile(rows[:, 1 : 4 * played + 1], (1, FILLED // played // 4, 1))
+        ),
+        donate_argnums=0,
+    )
+    rates = []
+    for block in range(blocks.count):  # as in a real run: one block after the other
+        agents, _ = take(block)
+        state = programs.update(agents, programs.init(agents), np.int32(0), np.int32(played))
+        state = programs.update(agents, state.replace(rows=fill(state.rows)), np.int32(start), np.int32(start + 50))
+        jax.block_until_ready(state)
+        chunk, first, spent, deadline = 250, start + 50, 0.0, time.perf_counter() + seconds / blocks.count
+        while time.perf_counter() < deadline and first + chunk < algorithm.iterations:
+            tick = time.perf_counter()
+            state = jax.block_until_ready(programs.update(agents, state, np.int32(first), np.int32(first + chunk)))
+            spent += time.perf_counter() - tick
+            first += chunk
+        rates.append((first - start - 50) * algorithm.steps_per_iteration * min(blocks.size, n_agents) / spent)
+    return {"agents": n_agents, "steps_per_second": float(np.mean(rates)), "compile_seconds": compile_seconds}
+
+
+def ceiling(agents_per_device: int, seconds: float) -> float:
+    """Environment steps/s if nothing but the batched matrix products of the same shapes had to be done."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+    from jax.sharding import Mesh, PartitionSpec
+
+    from uavmec_jax.learning.networks import matmul
+
+    devices = jax.local_devices()
+    mesh = Mesh(np.array(devices), ("agents",))
+    shapes = ((24, 64), (64, 64), (64, 12))
+
+    def products(_: int, carry: tuple) -> tuple:
+        x, one, weights, target = carry
+        for _ in range(4):  # acting
+            y = one
+            for w in weights:
+                y = y @ w
+            one = one + 1e-9 * jnp.sum(y, keepdims=True)
+        y = x
+        for w in target:  # the target's forward pass
+            y = y @ w
+
+        def forward(weights: tuple) -> jax.Array:  # forward and backward
+            z = x
+            for w in weights:
+                z = matmul(z, w)
+            return jnp.sum(z * y)
+
+        gradient = jax.grad(forward)(weights)
+        return x, one, jax.tree.map(lambda w, g: w - 1e-9 * g, weights, gradient), target
+
+    def many(carry: tuple, steps: int) -> tuple:
+        return jax.vmap(lambda carry: jax.lax.fori_loop(0, steps, products, carry))(carry)
+
+    n = agents_per_device * len(devices)
+    weights = tuple(jax.random.normal(jax.random.key(i), (n, *shape)) * 0.1 for i, shape in enumerate(shapes))
+    carry = (jnp.ones((n, 16, 24)), jnp.ones((n, 1, 24)), weights, tuple(w + 0 for w in weights))
+    split = PartitionSpec("agents")
+    run = jax.jit(jax.shard_map(many, mesh=mesh, in_specs=(split, PartitionSpec()), out_specs=split, check_vma=False))
+    carry = jax.block_until_ready(run(carry, 200))
+    rates, deadline = [], time.perf_counter() + seconds
+    while time.perf_counter() < deadline:
+        tick = time.perf_counter()
+        carry = jax.block_until_ready(run(carry, 1000))
+        rates.append(4 * 1000 * n / (time.perf_counter() - tick))
+    return float(np.median(rates))
+
+
+def sb3_worker(seconds: float) -> None:
+    """Print the environment steps/s of one Stable-Baselines3 process."""
+    os.environ["JAX_PLATFORMS"] = "cpu"
+    import numpy as np
+    import torch
+    from gymnasium_adapter import SingleScenario
+    from stable_baselines3 import DQN
+
+    from uavmec_jax.world.environment import make_scenario
+
+    torch.set_num_threads(1)  # faster than several for nets this small
+    model = DQN(
+        "MlpPolicy", SingleScenario(make_scenario()), learning_rate=0.0071, batch_size=16, gamma=0.98,
+        buffer_size=2 * FILLED, exploration_fraction=0.35, policy_kwargs={"net_arch": [64, 64]}, device="cpu", seed=0,
+    )  # fmt: skip
+    model.learn(2000)
+    buffer = model.replay_buffer
+    for array in (buffer.observations, buffer.next_observations, buffer.actions, buffer.rewards, buffer.dones):
+        array[:FILLED] = np.tile(array[:2000], (FILLED // 2000,) + (1,) * (array.ndim - 1))
+    buffer.pos = FILLED
+    steps, spent = 0, 0.0
+    while spent < seconds:
+        tick = time.perf_counter()
+        model.learn(1000, reset_num_timesteps=False)
+        spent += time.perf_counter() - tick
+        steps += 1000
+    print(json.dumps({"steps_per_second": steps / spent}))
+
+
+def sb3_speed(processes: int, seconds: float) -> float:
+    """Environment steps/s of that many Stable-Baselines3 processes together."""
+    command = [sys.executable, __file__, "--sb3-worker", "--seconds", str(seconds)]
+    running = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(processes)]
+    outputs = [process.communicate()[0] for process in running]
+    return sum(json.loads(output.splitlines()[-1])["steps_per_second"] for output in outputs)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=10.0, help="length of each measurement")
+    parser.add_argument("--out", type=Path, help="folder for benchmark_dqn.json")
+    parser.add_argument("--sb3-worker", action="store_true", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.sb3_worker:
+        sb3_worker(arguments.seconds)
+        return
+    from uavmec_jax.studies import host
+
+    host.use_every_core()
+    from importlib.util import find_spec
+
+    from rich.console import Console
+    from rich.table import Table
+
+    from uavmec_jax.learning.population import AGENTS_PER_CORE
+    from uavmec_jax.studies.speed import environment_speed
+
+    facts = host.describe()
+    report = {"command": " ".join(["python", *sys.argv]), **facts, "filled_transitions_per_agent": FILLED}
+    has_sb3 = find_spec("stable_baselines3") is not None
+    one = report["sb3_one_process"] = sb3_speed(1, arguments.seconds) if has_sb3 else float("nan")
+    cores = facts["cores"]
+    report["sb3_processes"] = cores
+    report["sb3_all_processes"] = sb3_speed(cores, arguments.seconds) if has_sb3 else float("nan")
+    report["training"] = [train_speed(n, arguments.seconds) for n in AGENTS]
+    report["ceiling"] = ceiling(AGENTS_PER_CORE - 2, arguments.seconds)
+    report["environment"] = {n: environment_speed(n, arguments.seconds) for n in (75, 4096)}
+
+    table = Table(title="DQN training, environment steps/s", title_justify="left")
+    for column in ("what", "steps/s", "x one SB3 process", "of the ceiling", "compile s"):
+        table.add_column(column, justify="left" if column == "what" else "right")
+    table.add_row("Stable-Baselines3, one process", f"{one:,.0f}", "1.0", "", "")
+    every = report["sb3_all_processes"]
+    table.add_row(f"Stable-Baselines3, {cores} processes", f"{every:,.0f}", f"{every / one:.1f}", "", "")
+    for row in report["training"]:
+        speed = row["steps_per_second"]
+        share = f"{speed / report['ceiling']:.0%}"
+        name = f"this package, {row['agents']} agent{'s' * (row['agents'] > 1)}"
+        table.add_row(name, f"{speed:,.0f}", f"{speed / one:.0f}", share, f"{row['compile_seconds']:.1f}")
+    table.add_row(
+        "matrix products of 76 agents alone", f"{report['ceiling']:,.0f}", f"{report['ceiling'] / one:.0f}", "100%", ""
+    )
+    for n, speed in report["environment"].items():
+        table.add_row(f"environment alone, {n} layouts", f"{speed:,.0f}", "", "", "")
+    Console(width=100).print(table)
+    if arguments.out:
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        (arguments.out / "benchmark_dqn.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,78 @@
+"""The paper's two training figures (Figure 3): mean episode length over the steps of training.
+
+    uv run python experiments/figure3_training.py --out results/figure3
+
+(a) Two learning rates on one layout, 0.01 and 0.0071, for 1,000,000 steps, and 0.0071 for 400,000 steps.
+(b) Three seeds with 8 powered and 8 connected devices.
+Thin lines: training episodes, 10,000 steps at a time; thick lines: the greedy policy on validation draws.
+"""
+
+import argparse
+from pathlib import Path
+
+from uavmec_jax.studies import host
+
+host.use_every_core()
+
+import numpy as np  # noqa: E402
+
+from uavmec_jax.reporting import figures  # noqa: E402
+from uavmec_jax.studies.results import Results  # noqa: E402
+from uavmec_jax.studies.run import run_study  # noqa: E402
+from uavmec_jax.studies.study import parse_study  # noqa: E402
+
+ONE_LAYOUT = "[axes]\npowered = [8]\nconnected = [8]\nseeds = {seeds}\n"
+
+
+def run(out: Path, name: str, seeds: list[int], steps: int, learning_rates: list[float]) -> Results:
+    text = ONE_LAYOUT.format(seeds=seeds) + f"learning_rate = {learning_rates}\n"
+    return run_study(parse_study(text, name, {"steps": steps, "name": name}), out / name)
+
+
+def draw(axis: object, results: Results, agent: int, label: str) -> None:
+    curves = results.curves
+    per_look = np.diff(np.searchsorted(curves["chunk_steps"], curves["look_steps"], side="right"), prepend=0)
+    ends = np.cumsum(per_look)
+    training = [
+        np.nanmean(curves["episode_length"][agent, end - n : end]) for end, n in zip(ends, per_look, strict=True)
+    ]
+    (line,) = axis.plot(curves["look_steps"], training, lw=0.8, alpha=0.5)
+    smooth = np.convolve(curves["validation"][agent], np.ones(5) / 5, mode="valid")
+    axis.plot(curves["look_steps"][2:-2], smooth, lw=1.8, color=line.get_color(), label=label)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("runs/figure3"))
+    parser.add_argument("--steps", type=int, default=1_000_000)
+    arguments = parser.parse_args()
+    steps = arguments.steps
+    long = run(arguments.out, "learning-rates", [0], steps, [0.01, 0.0071])
+    short = run(arguments.out, "short", [0], steps * 2 // 5, [0.0071])
+    seeds = run(arguments.out, "seeds", [0, 1, 2], steps, [0.0071])
+
+    figure = figures.new_figure(9, 7)
+    top, bottom = figure.subplots(2, 1)
+    draw(top, long, 0, f"learning rate 0.01, {steps:,} steps")
+    draw(top, long, 1, f"learning rate 0.0071, {steps:,} steps")
+    draw(top, short, 0, f"learning rate 0.0071, {short.study.steps:,} steps")
+    for agent in range(3):
+        draw(bottom, seeds, agent, f"seed {agent}")
+    for axis, title in (
+        (top, "(a) two learning rates, one layout"),
+        (bottom, "(b) three seeds, 8 powered, 8 connected"),
+    ):
+        axis.set(title=title, xlabel="environment steps", ylabel="episode length, slots")
+        axis.grid(alpha=0.3)
+        axis.legend()
+    figures.save(figure, arguments.out / "figure3.png")
+    for results in (long, short, seeds):
+        print(
+            results.agents[
+                ["seed", "learning_rate", "steps", "best_lifetime", "last_lifetime", "oldest_first_lifetime"]
+            ]
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,39 @@
+"""The paper's Table 5: lifetime for every combination of power and communication.
+
+    uv run python experiments/table5_grid.py [--seeds 10] [--study table5-tuned]
+
+The same as `uavmec run table5 --seeds 10`, as a script to start one's own from.
+"""
+
+import argparse
+from pathlib import Path
+
+from uavmec_jax.studies import host
+
+host.use_every_core()
+
+from rich.console import Console  # noqa: E402
+
+from uavmec_jax.reporting import figures, tables  # noqa: E402
+from uavmec_jax.studies.run import run_study  # noqa: E402
+from uavmec_jax.studies.study import load_study  # noqa: E402
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--study", default="table5")
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--steps", type=int, default=1_000_000)
+    parser.add_argument("--out", type=Path, default=Path("runs/table5-grid"))
+    arguments = parser.parse_args()
+
+    study = load_study(arguments.study, {"axes.seeds": arguments.seeds, "steps": arguments.steps})
+    results = run_study(study, arguments.out)
+    figures.save(figures.grid_figure(results), arguments.out / "figure.png")
+    console = Console()
+    for table in tables.tables(results):
+        console.print(table)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,29 @@
+"""Agents for the tests."""
+
+import jax
+import jax.numpy as jnp
+
+from uavmec_jax.learning.algorithm import Agent
+from uavmec_jax.learning.dqn import DQNHyper
+from uavmec_jax.world.environment import Scenario
+from uavmec_jax.world.layout import sample_layout
+from uavmec_jax.world.params import Params
+from uavmec_jax.world.rewards import make_reward
+
+
+def make_agent(seed=0, powered=8, connected=8, params=None, **hyper) -> Agent:
+    """One agent on a random layout."""
+    params = Params() if params is None else params
+    layout = sample_layout(jax.random.key(seed), params, powered, connected)
+    scenario = Scenario(params=params, layout=layout, reward=make_reward())
+    return jax.tree.map(jnp.asarray, Agent(jax.random.key(1000 + seed), scenario, DQNHyper(**hyper)))
+
+
+def stack(agents) -> Agent:
+    """A population, leaves ``[A, ...]``."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *agents)
+
+
+def take(tree, i):
+    """Agent ``i`` of a population."""
+    return jax.tree.map(lambda leaf: leaf[i], tree)

@@ -1,0 +1,196 @@
+"""The DQN: schedules, one update against NumPy, and what an agent may not do."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from tests.learning.agents import make_agent, stack
+from uavmec_jax.learning import dqn
+from uavmec_jax.learning.algorithm import AGENTS_AXIS
+from uavmec_jax.learning.dqn import DQNHyper, DQNSpec
+from uavmec_jax.learning.replay import Transition
+
+SPEC = DQNSpec(total_steps=20_000)
+HYPER = DQNHyper()
+
+
+def train(spec, agents, *bounds, state=None):
+    """A population through the iterations between the given bounds."""
+    over = lambda f, axes: jax.vmap(f, axes, axis_name=AGENTS_AXIS)  # noqa: E731
+    state = over(lambda a: dqn.init(spec, a), (0,))(agents) if state is None else state
+    update = jax.jit(over(lambda a, s, first, last: dqn.update(spec, a, s, first, last), (0, 0, None, None)))
+    for first, last in itertools.pairwise(bounds):
+        state = update(agents, state, first, last)
+    return state
+
+
+@pytest.mark.parametrize(
+    ("steps_done", "expected"),
+    # 1,000,000 steps: 1 -> 0.05 over the first 350,000. At 175,000 half-way: 0.525.
+    [(0, 1.0), (35_000, 0.905), (175_000, 0.525), (350_000, 0.05), (999_999, 0.05)],
+)
+def test_epsilon(steps_done, expected):
+    assert_allclose(dqn.epsilon(HYPER, 1_000_000, steps_done), expected, rtol=1e-6)
+
+
+def test_gradient_steps_are_counted_from_step_104():
+    spec = DQNSpec()
+    assert [int(dqn.gradient_steps(spec, HYPER, steps)) for steps in (4, 96, 100, 104, 108)] == [0, 0, 0, 1, 2]
+
+
+def test_target_is_due_at_multiples_of_the_interval():
+    spec = DQNSpec()
+    due = [steps for steps in range(4, 30_001, 4) if dqn.target_is_due(spec, HYPER, steps)]
+    assert due == [10_000, 20_000, 30_000]
+    odd = DQNHyper(target_interval=10)  # 10 lies in the iteration that ends at 12, 20 in the one that ends at 20
+    assert [steps for steps in range(4, 33, 4) if dqn.target_is_due(spec, odd, steps)] == [12, 20, 32]
+
+
+def test_first_gradient_step_falls_at_step_104():
+    agents = stack([make_agent(0)])
+    before = train(SPEC, agents, 0, 25)  # 100 steps
+    fresh = train(SPEC, agents, 0, 0)
+    jax.tree.map(assert_array_equal, before.weights, fresh.weights)
+    after = train(SPEC, agents, 25, 26, state=before)
+    moved = [(a != b).any() for a, b in zip(*map(jax.tree.leaves, (before.weights, after.weights)), strict=True)]
+    assert all(moved)
+
+
+def test_target_is_copied_before_the_gradient_step():
+    agents = stack([make_agent(0, target_interval=200)])
+    at_196 = train(SPEC, agents, 0, 49)
+    jax.tree.map(assert_array_equal, at_196.target, train(SPEC, agents, 0, 0).weights)
+    at_200 = train(SPEC, agents, 49, 50, state=at_196)
+    jax.tree.map(assert_array_equal, at_200.target, at_196.weights)
+    assert any((a != b).any() for a, b in zip(*map(jax.tree.leaves, (at_200.target, at_200.weights)), strict=True))
+
+
+def test_warm_up_explores_uniformly():
+    agents = stack([make_agent(0, learning_starts=20_000, exploration_initial_eps=0.0, exploration_final_eps=0.0)])
+    state = train(SPEC, agents, 0, 5_000)
+    actions = np.asarray(state.rows[0, 1:, -1]) & 255
+    counts = np.bincount(actions, minlength=12)
+    assert counts.min() > 1400  # 20,000 / 12 = 1,667, standard deviation 39
+
+
+def numpy_update(weights, target, batch, hyper):
+    """One DQN update in NumPy, float64: forward, Huber, backward, clip, Adam's first step."""
+    layers = [{k: np.asarray(v, float) for k, v in weights["params"][f"TorchDense_{i}"].items()} for i in range(3)]
+    olds = [{k: np.asarray(v, float) for k, v in target["params"][f"TorchDense_{i}"].items()} for i in range(3)]
+
+    def forward(net, x):
+        inputs = []
+        for i, layer in enumerate(net):
+            inputs.append(x)
+            x = x @ layer["kernel"] + layer["bias"]
+            x = np.maximum(x, 0) if i < 2 else x
+        return x, inputs
+
+    best = forward(olds, np.asarray(batch.next_observation, float))[0].max(axis=1)
+    goal = np.asarray(batch.reward, float) + (1 - np.asarray(batch.terminated)) * hyper.gamma * best
+    q, inputs = forward(layers, np.asarray(batch.observation, float))
+    rows = np.arange(len(goal))
+    error = q[rows, batch.action] - goal
+    loss = np.where(np.abs(error) < 1, 0.5 * error**2, np.abs(error) - 0.5).mean()
+    delta = np.zeros_like(q)
+    delta[rows, batch.action] = np.clip(error, -1, 1) / len(goal)
+    gradients = []
+    for i in (2, 1, 0):
+        gradients.insert(0, {"kernel": inputs[i].T @ delta, "bias": delta.sum(axis=0)})
+        delta = (delta @ layers[i]["kernel"].T) * (inputs[i] > 0)
+    norm = np.sqrt(sum((g**2).sum() for layer in gradients for g in layer.values()))
+    factor = min(hyper.max_grad_norm / (norm + 1e-6), 1.0)
+    for layer, gradient in zip(layers, gradients, strict=True):
+        for name, g in gradient.items():
+            g = g * factor
+            m_hat, v_hat = g, g * g  # the first step: bias correction undoes (1 - beta)
+            layer[name] = layer[name] - hyper.learning_rate * m_hat / (np.sqrt(v_hat) + 1e-8)
+    return loss, layers
+
+
+@pytest.mark.parametrize("max_grad_norm", [10.0, 0.01])
+def test_update_against_numpy(max_grad_norm):
+    spec, hyper = DQNSpec(), DQNHyper(max_grad_norm=max_grad_norm, learning_starts=0)
+    rng = np.random.default_rng(0)
+    observation = np.concatenate([rng.random((2, 16, 12)), rng.integers(0, 12, (2, 16, 12))], axis=-1).astype(
+        np.float32
+    )
+    batch = Transition(
+        observation=jnp.asarray(observation[0]),
+        action=jnp.asarray(rng.integers(0, 12, 16), jnp.int32),
+        reward=jnp.asarray(rng.normal(size=16), jnp.float32),
+        terminated=jnp.asarray(rng.random(16) < 0.3, jnp.float32),
+        next_observation=jnp.asarray(observation[1]),
+    )
+    agent = make_agent(0)
+    state = dqn.init(spec, agent)
+    target = jax.tree.map(lambda leaf: leaf * 1.1, state.weights)
+    after = dqn._learn(spec, hyper, state.replace(target=target), batch, jnp.int32(4))
+    loss, layers = numpy_update(state.weights, target, batch, hyper)
+    assert_allclose(after.loss, loss, rtol=1e-5)
+    for i, layer in enumerate(layers):
+        for name, expected in layer.items():
+            # Adam's first step is +-lr for any gradient above its epsilon: where the gradient is rounding noise skip it
+            assert_allclose(after.weights["params"][f"TorchDense_{i}"][name], expected, rtol=1e-4, atol=2e-5)
+
+
+def test_same_seed_is_bit_equal_and_seeds_differ():
+    agents = stack([make_agent(0), make_agent(0), make_agent(1)])
+    state, again = train(SPEC, agents, 0, 300), train(SPEC, agents, 0, 300)
+    jax.tree.map(assert_array_equal, state, again)
+    kernel = state.weights["params"]["TorchDense_1"]["kernel"]
+    assert_array_equal(kernel[0], kernel[1])
+    assert (kernel[0] != kernel[2]).any()
+
+
+def test_chunks_do_not_matter():
+    agents = stack([make_agent(0), make_agent(1)])
+    whole, pieces = train(SPEC, agents, 0, 400), train(SPEC, agents, 0, 7, 150, 400)
+    jax.tree.map(assert_array_equal, whole.weights, pieces.weights)
+    assert_array_equal(whole.rows, pieces.rows)
+
+
+def test_batched_agent_is_the_agent_alone():
+    hypers = [{}, {"gamma": 0.9}, {"learning_rate": 1e-3, "target_interval": 500}, {"learning_starts": 400}]
+    agents = [make_agent(i, powered=4 + 2 * i, **hyper) for i, hyper in enumerate(hypers)]
+    together = train(SPEC, stack(agents), 0, 250)
+    for i, agent in enumerate(agents):
+        alone = train(SPEC, stack([agent]), 0, 250)
+        assert_array_equal(alone.rows[0, :, -1], together.rows[i, :, -1])  # the same actions and ends
+        for a, b in zip(*map(jax.tree.leaves, (alone.weights, together.weights)), strict=True):
+            assert_allclose(a[0], b[i], rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "bad", [{"learning_rate": np.inf}, {"learning_rate": np.nan}, {"gamma": np.nan}, {"learning_rate": 1e35}]
+)
+def test_diverged_agent_is_frozen_marked_and_touches_nobody(bad):
+    sound = [make_agent(0), make_agent(1), make_agent(2)]
+    state = train(SPEC, stack([sound[0], make_agent(1, **bad), sound[2]]), 0, 200)
+    without = train(SPEC, stack(sound), 0, 200)
+    assert_array_equal(state.diverged_at, [-1, 104, -1])
+    for leaf, other in zip(*map(jax.tree.leaves, (state.weights, without.weights)), strict=True):
+        assert np.isfinite(leaf).all()
+        assert_array_equal(leaf[jnp.array([0, 2])], other[jnp.array([0, 2])])
+    fresh = train(SPEC, stack(sound), 0, 0)
+    jax.tree.map(lambda a, b: assert_array_equal(a[1], b[1]), state.weights, fresh.weights)
+
+
+def test_loss_that_overflows_freezes_later():
+    # The learning rate is legal, the weights grow until the loss overflows: marked after the first updates, still finite.
+    state = train(SPEC, stack([make_agent(0, learning_rate=1e25), make_agent(1)]), 0, 200)
+    assert state.diverged_at[0] > 104
+    assert state.diverged_at[1] == -1
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.weights))
+
+
+def test_frozen_agent_stays_as_it_was():
+    agents = stack([make_agent(0, gamma=np.nan)])
+    early = train(SPEC, agents, 0, 30)
+    late = train(SPEC, agents, 30, 100, state=early)
+    assert early.diverged_at[0] == late.diverged_at[0] == 104
+    jax.tree.map(assert_array_equal, early.weights, late.weights)

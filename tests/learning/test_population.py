@@ -1,0 +1,124 @@
+"""The population: blocks, looks, curves, devices, learning."""
+
+import jax
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from tests.learning.agents import make_agent, stack
+from uavmec_jax.learning import dqn, population
+from uavmec_jax.learning.dqn import DQNSpec
+from uavmec_jax.learning.population import Blocks, PopulationTooLargeError, Validation, plan_blocks
+from uavmec_jax.planning.heuristics import HEURISTICS
+from uavmec_jax.world.rollout import rollouts
+
+GIB = 2**30
+
+
+def train(agents, steps=2000, blocks=None, validation=None, **spec):
+    algorithm = dqn.algorithm(DQNSpec(total_steps=steps, **spec))
+    n = agents.key.shape[0]
+    validation = validation or Validation(every=800, draws=4)
+    keys = jax.random.split(jax.random.key(9), (n, validation.draws))
+    news = []
+    trained = list(
+        population.train(
+            algorithm,
+            agents,
+            keys,
+            validation=validation,
+            blocks=blocks or plan_blocks(n, algorithm.agent_bytes, GIB),
+            on_progress=news.append,
+        )
+    )
+    return trained, news
+
+
+def test_blocks_are_equal_cover_everyone_and_fit():
+    assert plan_blocks(250, 64 * 10**6, 16 * GIB) == Blocks(count=4, size=64, devices=2, bytes=64 * 64 * 10**6)
+    assert plan_blocks(1, 10, GIB) == Blocks(count=1, size=1, devices=1, bytes=10)
+    for n in (1, 2, 3, 75, 81, 1000):
+        for memory in (GIB, 10 * GIB):
+            blocks = plan_blocks(n, 64 * 2**20, memory)
+            assert blocks.count * blocks.size >= n
+            assert (blocks.count - 1) * blocks.size < n
+            assert blocks.bytes <= memory
+            assert blocks.size % blocks.devices == 0
+
+
+def test_too_little_memory_is_said():
+    assert plan_blocks(10, 3 * GIB, 4 * GIB).devices == 1
+    with pytest.raises(PopulationTooLargeError, match=r"one agent needs 5.0 GiB and 4.0 GiB are free"):
+        plan_blocks(10, 5 * GIB, 4 * GIB)
+
+
+def test_what_a_block_leaves():
+    agents = stack([make_agent(i) for i in range(3)])
+    (block,), news = train(agents)
+    assert block.agents == slice(0, 3)
+    assert_array_equal(block.look_steps, [800, 1600, 2000])
+    assert block.validation.shape == (3, 3)
+    assert block.episode_length.shape == (3, len(block.chunk_steps)) == (3, 12)
+    assert block.chunk_steps[-1] == 2000
+    assert_array_equal(block.diverged_at, -1)
+    assert_array_equal(block.best_score, block.validation.max(axis=1))
+    assert_array_equal(block.best_step, block.look_steps[block.validation.argmax(axis=1)])
+    assert news[-1].steps == news[-1].of_steps == 6000
+    assert 9 < news[-1].mean_length < 40
+    assert set(block.seconds) == {"compile", "train", "validate"}
+
+
+def test_best_weights_are_those_of_the_best_look():
+    agents = stack([make_agent(i) for i in range(2)])
+    (block,), _ = train(agents)
+    algorithm = dqn.algorithm(DQNSpec(total_steps=2000))
+    keys = jax.random.split(jax.random.key(9), (2, 4))
+
+    def score(agent, weights, draws):
+        scenario = agent.scenario
+        return rollouts(algorithm.policy(agent.hyper, weights), scenario.params, scenario.layout, draws).length.mean()
+
+    assert_allclose(jax.vmap(score)(agents, block.best, keys), block.best_score, rtol=1e-6)
+    assert_allclose(jax.vmap(score)(agents, block.last, keys), block.validation[:, -1], rtol=1e-6)
+
+
+def test_blocks_padding_and_devices_do_not_change_an_agent():
+    agents = stack([make_agent(i) for i in range(5)])
+    (whole,), _ = train(agents, blocks=Blocks(1, 6, 2, 0))
+    split, _ = train(agents, blocks=Blocks(2, 4, 2, 0))
+    single, _ = train(agents, blocks=Blocks(1, 5, 1, 0))
+    assert [block.agents for block in split] == [slice(0, 4), slice(4, 5)]
+    pieces = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(block.last for block in split))
+    for other in (pieces, single[0].last):
+        jax.tree.map(lambda a, b: assert_allclose(a, b, rtol=1e-3, atol=1e-4), whole.last, other)
+
+
+def test_small_replay_wraps():
+    agents = stack([make_agent(0), make_agent(1)])
+    (block,), _ = train(agents, replay_capacity=100)
+    assert_array_equal(block.diverged_at, -1)
+    assert np.isfinite(block.validation).all()
+
+
+def test_odd_train_frequency_and_widths():
+    (block,), _ = train(stack([make_agent(0)]), steps=1001, train_frequency=3, hidden=(8,), batch_size=5)
+    assert block.chunk_steps[-1] == 1002  # whole iterations
+    assert block.last["params"]["TorchDense_0"]["kernel"].shape == (1, 24, 8)
+
+
+@pytest.mark.slow
+def test_dqn_learns_to_beat_random_by_far():
+    # 12 powered, 8 connected: random lives about 16 slots, oldest-first 29. On three layouts, best weights of 60,000 steps.
+    agents = stack([make_agent(i, powered=12, connected=8) for i in range(4)])
+    (block,), _ = train(agents, steps=60_000, validation=Validation(every=5_000, draws=8))
+    algorithm = dqn.algorithm(DQNSpec(total_steps=60_000))
+    keys = jax.random.split(jax.random.key(77), (4, 16))
+
+    def lifetimes(agent, weights, draws):
+        scenario = agent.scenario
+        world = (scenario.params, scenario.layout, draws)
+        ours = rollouts(algorithm.policy(agent.hyper, weights), *world).length.mean()
+        return ours, rollouts(HEURISTICS["random"], *world).length.mean()
+
+    ours, random = jax.vmap(lifetimes)(agents, block.best, keys)
+    assert ours.mean() > 1.4 * random.mean()

@@ -1,0 +1,197 @@
+"""Whole runs: what they leave, and that it can be read back."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.testing import assert_array_equal
+
+from uavmec_jax.reporting import figures, tables
+from uavmec_jax.studies import host
+from uavmec_jax.studies.results import load_results, load_weights
+from uavmec_jax.studies.run import check_directory, plan_study, run_study
+from uavmec_jax.studies.schema import StudyError
+from uavmec_jax.studies.study import parse_study
+
+TOML = """
+name = "tiny"
+steps = 600
+[axes]
+powered = [12, 4]
+connected = [12, 4]
+seeds = 2
+[evaluation]
+draws = 5
+validate_every = 200
+validation_draws = 3
+"""
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    directory = tmp_path_factory.mktemp("runs") / "täst run"
+    return run_study(parse_study(TOML, "tiny"), directory, command="uavmec run tiny.toml"), directory
+
+
+def test_files_of_a_run(finished):
+    _, directory = finished
+    names = {file.name for file in directory.iterdir()}
+    assert names == {"study.toml", "run.json", "agents.csv", "curves.npz", "evaluation.npz", "weights.npz"}
+    run = json.loads((directory / "run.json").read_text())
+    assert run["complete"]
+    assert run["command"] == "uavmec run tiny.toml"
+    assert run["seeds"] == [0, 1]
+    assert run["environment_steps"] == 8 * 600
+    assert run["versions"]["jax"]
+    assert run["training_steps_per_second"] > 0
+
+
+def test_tidy_table_has_one_row_per_agent(finished):
+    _, directory = finished
+    agents = pd.read_csv(directory / "agents.csv")
+    assert len(agents) == 8
+    assert agents.columns[:3].tolist() == ["seed", "powered", "connected"]
+    for policy in ("best", "last", "stay_put", "random", "round_robin", "oldest_first"):
+        assert agents[f"{policy}_lifetime"].between(5, 40).all()
+        assert set(agents[f"{policy}_cause"]) <= {"battery", "data_age", "uav"}
+    rich = agents[(agents.powered == 12) & (agents.connected == 12)]
+    assert (rich["stay_put_lifetime"] == 33).all()
+    assert (rich["stay_put_cause"] == "uav").all()
+    assert (rich["stay_put_first_device"] == 0).all()
+
+
+def test_read_back_equals_what_was_run(finished):
+    results, directory = finished
+    again = load_results(directory)
+    assert again.study == results.study
+    pd.testing.assert_frame_equal(again.agents, results.agents, check_dtype=False, rtol=1e-5)
+    for mine, theirs in ((results.curves, again.curves), (results.evaluation, again.evaluation)):
+        assert mine.keys() == theirs.keys()
+        for name in mine:
+            assert_array_equal(mine[name], theirs[name])
+    assert results.curves["validation"].shape == (8, 3)
+    assert results.evaluation["best/lifetime"].shape == (8, 6)
+    kernel = load_weights(directory)["params"]["TorchDense_0"]["kernel"]
+    assert_array_equal(kernel, results.weights["best/params/TorchDense_0/kernel"])
+    with pytest.raises(StudyError, match="holds no 'worst' weights"):
+        load_weights(directory, "worst")
+
+
+def test_cells_are_means_over_seeds(finished):
+    results, _ = finished
+    cells = results.cells()
+    assert len(cells) == 4
+    cell = cells[(cells.powered == 4) & (cells.connected == 12)].iloc[0]
+    values = results.agents.query("powered == 4 and connected == 12")["best_lifetime"]
+    assert cell["best"] == values.mean()
+    assert cell["best_low"] <= cell["best"] <= cell["best_high"]
+    share = results.first_failures("best")
+    assert share.shape == (8, 12)
+    assert ((share.sum(axis=1) < 1.0001) & (share >= 0).all(axis=1)).all()
+
+
+def test_tables_and_figures(finished, tmp_path):
+    results, _ = finished
+    assert len(tables.tables(results)) == 3
+    assert "Mean over 4 cells" in tables.summary(results)[0]
+    for figure in (figures.run_figure(results), figures.curves_figure(results)):
+        figures.save(figure, tmp_path / "figure.png")
+        assert (tmp_path / "figure.png").stat().st_size > 10_000
+
+
+def test_other_axes_make_a_list():
+    study = parse_study(TOML, "tiny", {"axes.gamma": [0.9, 0.98], "axes.powered": [8], "axes.seeds": 1})
+    results = run_study(study)
+    assert len(results.cells()) == 4
+    (table,) = tables.tables(results)
+    assert table.row_count == 4
+    assert tables.summary(results)
+    assert figures.run_figure(results)
+
+
+def test_blocks_one_after_the_other_give_every_agent_once(finished, monkeypatch):
+    study = finished[0].study
+    per_agent = plan_study(study).blocks.bytes // plan_study(study).blocks.size
+    monkeypatch.setattr(host, "free_memory", lambda: 2 * per_agent + 1_000_000)
+    assert plan_study(study).blocks.count == 4
+    pieces = run_study(study)
+    assert pieces.run["complete"]
+    pd.testing.assert_frame_equal(pieces.agents.iloc[:, :3], finished[0].agents.iloc[:, :3])
+    assert_array_equal(pieces.evaluation["oldest_first/lifetime"], finished[0].evaluation["oldest_first/lifetime"])
+    assert pieces.curves["validation"].shape == (8, 3)
+
+
+def test_interrupted_run_keeps_the_finished_blocks(finished, monkeypatch, tmp_path):
+    study = finished[0].study
+    per_agent = plan_study(study).blocks.bytes // plan_study(study).blocks.size
+    monkeypatch.setattr(host, "free_memory", lambda: 4 * per_agent + 1_000_000)
+    assert plan_study(study).blocks.count == 2
+
+    def interrupt(progress):
+        if progress.block == 1:
+            raise KeyboardInterrupt
+
+    results = run_study(study, tmp_path / "half", on_progress=interrupt)
+    assert not results.run["complete"]
+    assert len(load_results(tmp_path / "half").agents) == 4
+
+
+def test_run_that_does_not_fit_is_refused_before_anything_is_written(finished, monkeypatch, tmp_path):
+    with pytest.raises(StudyError, match=r"tiny: steps is 10000000000: one agent needs"):
+        run_study(parse_study(TOML, "tiny", {"steps": 10**10, "dqn.replay_capacity": 10**10}), tmp_path / "big")
+    with pytest.raises(StudyError, match=r"8,000,000,000 agents need .* GiB before any of them trains"):
+        plan_study(parse_study(TOML, "tiny", {"axes.seeds": 2 * 10**9}))
+    assert not (tmp_path / "big").exists()
+
+
+def test_folder_that_is_taken_is_refused(finished, tmp_path):
+    _, directory = finished
+    with pytest.raises(StudyError, match="already holds a run"):
+        check_directory(directory)
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(StudyError, match="not an empty folder"):
+        check_directory(tmp_path)
+    check_directory(tmp_path / "new")
+
+
+def damage(directory, tmp_path, name, content):
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    for file in directory.iterdir():
+        (copy / file.name).write_bytes(file.read_bytes())
+    (copy / name).write_bytes(content((directory / name).read_bytes()))
+    return copy
+
+
+@pytest.mark.parametrize("name", ["run.json", "curves.npz", "evaluation.npz", "study.toml"])
+def test_damaged_file_is_named(finished, tmp_path, name):
+    copy = damage(finished[1], tmp_path, name, lambda data: data[: len(data) // 2])
+    with pytest.raises(StudyError, match=r"cannot be read|not TOML|is missing"):
+        load_results(copy)
+
+
+def test_flipped_bit_in_the_weights_is_found(finished, tmp_path):
+    def flip(data):
+        middle = len(data) // 2
+        return data[:middle] + bytes([data[middle] ^ 1]) + data[middle + 1 :]
+
+    with pytest.raises(StudyError, match=r"weights.npz: cannot be read"):
+        load_weights(damage(finished[1], tmp_path, "weights.npz", flip))
+
+
+def test_newer_schema_and_no_run(finished, tmp_path):
+    newer = damage(finished[1], tmp_path, "run.json", lambda data: data.replace(b'"schema": 1', b'"schema": 99'))
+    with pytest.raises(StudyError, match="schema is 99; this version reads up to 1"):
+        load_results(newer)
+    with pytest.raises(StudyError, match="holds no run"):
+        load_results(tmp_path)
+
+
+def test_same_study_twice_is_equal_to_the_bit(finished):
+    results, _ = finished
+    again = run_study(results.study)
+    for name, leaf in results.weights.items():
+        assert_array_equal(leaf, again.weights[name])
+    assert_array_equal(results.curves["episode_length"], again.curves["episode_length"])
+    assert np.isfinite(results.agents["best_lifetime"]).all()

@@ -1,0 +1,160 @@
+"""Study files: good ones become populations, bad ones one clear line."""
+
+import jax
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from uavmec_jax.studies import study as studies
+from uavmec_jax.studies.schema import StudyError
+from uavmec_jax.studies.study import (
+    evaluation_keys,
+    identities,
+    load_study,
+    make_agents,
+    make_algorithm,
+    n_agents,
+    parse_study,
+    study_toml,
+    validation_keys,
+)
+
+SMALL = """
+steps = 400
+[axes]
+powered = [8, 4]
+connected = [6]
+seeds = 2
+"""
+
+
+@pytest.mark.parametrize("name", sorted(studies.shipped()))
+def test_shipped_studies_are_valid_and_round_trip(name):
+    study = load_study(name)
+    assert study.name == name
+    assert parse_study(study_toml(study), "again") == study
+    assert n_agents(study) == len(identities(study)) == 250
+
+
+def test_table5_is_the_paper():
+    study = load_study("table5")
+    assert study.axes["powered"] == study.axes["connected"] == [12, 10, 8, 6, 4]
+    assert (study.steps, study.reward, study.guard) == (1_000_000, "U+log(A/O)", "clamp")
+    dqn = study.dqn
+    assert (dqn.learning_rate, dqn.batch_size, dqn.gamma, dqn.hidden) == (0.0071, 16, 0.98, (64, 64))
+    assert (dqn.exploration_fraction, dqn.exploration_initial_eps, dqn.exploration_final_eps) == (0.35, 1.0, 0.05)
+    assert (dqn.train_frequency, dqn.target_interval, dqn.learning_starts, dqn.max_grad_norm) == (4, 10_000, 100, 10.0)
+    assert make_algorithm(study).iterations == 250_000
+
+
+def test_population_is_the_product_of_the_axes():
+    study = parse_study(SMALL, "small", {"axes.learning_rate": [0.01, 0.001, 0.1], "axes.reward": ["A", "U"]})
+    who = identities(study)
+    assert len(who) == 2 * 2 * 3 * 2
+    assert list(who[0]) == ["seed", "powered", "connected", "learning_rate", "reward"]
+    agents = make_agents(study)
+    assert_array_equal(agents.hyper.learning_rate, np.float32([agent["learning_rate"] for agent in who]))
+    assert_array_equal(agents.scenario.layout.has_power.sum(axis=1), [agent["powered"] for agent in who])
+    assert_array_equal(agents.scenario.reward.weights[0], [1, 0, 0, 0, 0, 0, 0, 0])
+    assert_array_equal(agents.scenario.reward.weights[1], [0, 1, 0, 0, 0, 0, 0, 0])
+    leaves = jax.tree.leaves(agents)
+    assert {leaf.shape[0] for leaf in leaves} == {24}
+
+
+def test_an_agent_is_who_it_is_whoever_trains_beside_it():
+    few, many = parse_study(SMALL, "x"), parse_study(SMALL, "x", {"axes.powered": [12, 8, 4], "axes.seeds": [7, 1]})
+    place = [(i, j) for i, a in enumerate(identities(few)) for j, b in enumerate(identities(many)) if a == b]
+    assert len(place) == 2  # seed 1, powered 8 and 4
+    mine, theirs = ([p[k] for p in place] for k in (0, 1))
+    for make in (lambda s: make_agents(s).scenario.layout.position, lambda s: jax.random.key_data(make_agents(s).key)):
+        assert_array_equal(make(few)[np.array(mine)], make(many)[np.array(theirs)])
+    for keys in (validation_keys, evaluation_keys):
+        data = [jax.random.key_data(keys(s)) for s in (few, many)]
+        assert_array_equal(data[0][np.array(mine)], data[1][np.array(theirs)])
+
+
+def test_draws_for_training_validation_and_evaluation_are_different():
+    study = parse_study(SMALL, "x")
+    agents, looks, judged = make_agents(study).key, validation_keys(study), evaluation_keys(study)
+    assert judged.shape == (4, 33)
+    numbers = [jax.random.key_data(keys).reshape(-1, 2) for keys in (agents, looks, judged[:, :-1])]
+    together = np.concatenate(numbers)
+    assert len(np.unique(together, axis=0)) == len(together)
+    fixed = jax.random.key_data(judged[:, -1])
+    assert len(np.unique(fixed, axis=0)) == 1
+
+
+def test_scenario_parameters_and_devices_are_settings():
+    study = parse_study(
+        SMALL, "x", {"params.n_devices": 20, "params.region_m": [400.0, 300.0], "axes.uav_speed_m_s": [5.0, 10.0]}
+    )
+    agents = make_agents(study)
+    assert agents.scenario.layout.position.shape == (8, 20, 2)
+    assert agents.scenario.layout.position[..., 1].max() <= 300
+    assert_array_equal(agents.scenario.params.uav_speed_m_s, [5, 10] * 4)
+
+
+BAD = [
+    ({"colour": "red"}, "bad.toml: colour is not a setting"),
+    ({"dqn.gama": 0.9}, "bad.toml: dqn.gama is not a setting; did you mean 'gamma'?"),
+    ({"steps": "many"}, "bad.toml: steps is 'many'; it should be a valid integer"),
+    ({"steps": 0}, "bad.toml: steps is 0; it should be greater than or equal to 1"),
+    ({"steps": 1.5}, "bad.toml: steps is 1.5; it should be a valid integer"),
+    ({"dqn.learning_rate": float("nan")}, "bad.toml: dqn.learning_rate is nan; it should be a finite number"),
+    ({"dqn.learning_rate": -0.1}, "bad.toml: dqn.learning_rate is -0.1; it should be greater than 0"),
+    ({"dqn.train_frequency": 0}, "bad.toml: dqn.train_frequency is 0"),
+    ({"dqn": 3}, "bad.toml: dqn is 3; it should be"),
+    (
+        {"params.uav_flying_power_w": -150.0},
+        "bad.toml: params.uav_flying_power_w is -150.0; it should be greater than or",
+    ),
+    ({"params.n_devices": 65}, "bad.toml: params.n_devices is 65; it should be less than or equal to 64"),
+    (
+        {"params.device_battery_range_j": [8e4, 5e4]},
+        "bad.toml: params.device_battery_range_j is [80000.0, 50000.0]; give",
+    ),
+    ({"axes.powered": [13]}, "bad.toml: axes.powered has 13; give whole numbers from 0 to 12, the number of devices"),
+    ({"axes.connected": [-1]}, "bad.toml: axes.connected has -1; give whole numbers from 0 to 12"),
+    ({"axes.connected": [True]}, "bad.toml: axes.connected has True; give whole numbers"),
+    ({"axes.powered": []}, "bad.toml: axes.powered is empty; give at least one value"),
+    ({"axes.powered": [4, 4]}, "bad.toml: axes.powered repeats a value"),
+    ({"axes.powered": 8}, "bad.toml: axes.powered is 8; give a list"),
+    ({"axes.seeds": 0}, "bad.toml: axes.seeds is 0; give at least 1 seed"),
+    ({"axes.seeds": [-3]}, "bad.toml: axes.seeds has -3"),
+    ({"axes.learning_rate": [float("nan")]}, "bad.toml: axes.learning_rate has nan; it should be a finite number"),
+    ({"axes.learning_rates": [0.1]}, "bad.toml: axes.learning_rates is not an axis; did you mean 'learning_rate'?"),
+    ({"axes.batch_size": [8, 16]}, "bad.toml: axes.batch_size is not an axis"),
+    ({"axes.reward": ["A", "B+C"]}, "bad.toml: axes.reward is 'B+C', which is not a reward"),
+    ({"reward": "U+log(A/0)"}, "bad.toml: reward is 'U+log(A/0)', which is not a reward; did you mean 'U+log(A/O)'?"),
+    ({"reward": {"Q": 1.0}}, "bad.toml: reward has the term 'Q', which is not one"),
+    ({"guard": "none"}, "bad.toml: guard is 'none'; it should be 'clamp' or 'log1p'"),
+    ({"algorithm": "sarsa"}, "bad.toml: algorithm is 'sarsa'; it should be 'dqn'"),
+    ({"name": "../x"}, "bad.toml: name is '../x'"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), BAD, ids=[message[10:50] for _, message in BAD])
+def test_bad_setting_is_one_clear_line(change, message):
+    with pytest.raises(StudyError) as error:
+        parse_study(SMALL, "bad.toml", change)
+    assert str(error.value).startswith(message)
+    assert "\n" not in str(error.value)
+
+
+def test_missing_axis():
+    with pytest.raises(StudyError, match=r"x: axes.connected is missing"):
+        parse_study("[axes]\npowered = [4]\nseeds = 1", "x")
+    with pytest.raises(StudyError, match="x: axes is missing"):
+        parse_study("steps = 10", "x")
+
+
+def test_not_toml_and_not_there(tmp_path):
+    with pytest.raises(StudyError, match="x: not TOML"):
+        parse_study("steps = = 3", "x")
+    with pytest.raises(StudyError, match=r"neither a study file nor a shipped study; did you mean 'table5'"):
+        load_study("tabel5")
+    with pytest.raises(StudyError, match="no such file"):
+        load_study(tmp_path / "none.toml")
+    (tmp_path / "latin.toml").write_bytes(b"name = '\xe9'")
+    with pytest.raises(StudyError, match="cannot be read"):
+        load_study(tmp_path / "latin.toml")

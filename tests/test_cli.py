@@ -1,0 +1,160 @@
+"""The command line, as a user meets it: a subprocess."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+TOML = """
+steps = 400
+[axes]
+powered = [12, 8]
+connected = [8]
+seeds = 2
+[evaluation]
+draws = 4
+"""
+
+
+def uavmec(*arguments, cwd=None, check=True):
+    done = subprocess.run(
+        [sys.executable, "-m", "uavmec_jax", *map(str, arguments)], cwd=cwd, capture_output=True, text=True, timeout=300
+    )
+    assert not check or done.returncode == 0, done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def run_directory(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("cli")
+    (folder / "my.toml").write_text(TOML)
+    done = uavmec("run", "my.toml", "--out", "out", "--set", "dqn.gamma=0.9", "--steps", "200", cwd=folder)
+    return folder / "out", done
+
+
+def test_help_does_not_import_jax():
+    code = (
+        "import sys; from uavmec_jax.cli import main\n"
+        "try: main(['--help'])\nexcept SystemExit: pass\n"
+        "print('jax' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert "run table5 --quick" in done.stdout
+    assert done.stdout.strip().endswith("False")
+    for command in ("run", "show", "validate", "doctor"):
+        assert "Usage" in uavmec(command, "--help").stdout
+
+
+def test_run_prints_the_tables_and_leaves_the_files(run_directory):
+    directory, done = run_directory
+    assert "4 agents x 200 steps in 1 block" in done.stdout
+    for words in (
+        "Lifetime in slots, `best` weights",
+        "`last` weights",
+        "First to fail",
+        "Mean over 2 cells",
+        "Files: out",
+    ):
+        assert words in done.stdout
+    names = {file.name for file in directory.iterdir()}
+    assert names == {
+        "study.toml", "run.json", "agents.csv", "curves.npz", "evaluation.npz", "weights.npz", "figure.png"
+    }  # fmt: skip
+    run = json.loads((directory / "run.json").read_text())
+    assert run["command"] == "uavmec run my.toml --out out --set dqn.gamma=0.9 --steps 200"
+    assert "gamma = 0.9\n" in (directory / "study.toml").read_text()
+
+
+def test_show_prints_the_same_tables(run_directory):
+    directory, done = run_directory
+    shown = uavmec("show", directory)
+    table = done.stdout[done.stdout.index("Lifetime") : done.stdout.index("Files:")]
+    assert table in shown.stdout
+    cells = json.loads(uavmec("show", directory, "--json").stdout)["cells"]
+    assert [(cell["powered"], cell["connected"], cell["seeds"]) for cell in cells] == [(12, 8, 2), (8, 8, 2)]
+    assert {"best", "best_low", "best_high", "last", "oldest_first", "best_first_device"} <= cells[0].keys()
+
+
+def test_resolved_study_runs_again(run_directory, tmp_path):
+    directory, _ = run_directory
+    done = uavmec("run", directory / "study.toml", "--out", tmp_path / "again", "--json")
+    first = json.loads(uavmec("show", directory, "--json").stdout)
+    again = json.loads(done.stdout)
+    assert again["cells"] == first["cells"]
+
+
+def test_validate_and_doctor(run_directory, tmp_path):
+    assert "table5: a valid study: 250 agents x 1,000,000 steps" in uavmec("validate", "table5").stdout
+    assert json.loads(uavmec("validate", "table5", "--json").stdout)["steps"] == 1_000_000
+    facts = json.loads(uavmec("doctor", "--json").stdout)
+    assert facts["environment_steps_per_second"] > 10_000
+    assert facts["devices"]
+    assert "jax" in uavmec("doctor").stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["run", "tabel5"], "uavmec: tabel5: neither a study file nor a shipped study; did you mean 'table5'?"),
+        (["run", "table5", "--seeds", "0"], "uavmec: table5: axes.seeds is 0; give at least 1 seed"),
+        (["run", "table5", "--set", "axes.powered=[13]"], "uavmec: table5: axes.powered has 13; give whole numbers"),
+        (
+            ["run", "table5", "--set", "reward=U+log(A/0)"],
+            "uavmec: table5: reward is 'U+log(A/0)', which is not a reward",
+        ),
+        (["run", "table5", "--set", "dqn.learning_rate=nan"], "uavmec: table5: dqn.learning_rate is nan"),
+        (["run", "table5", "--set", "params.uav_battery_j=-1"], "uavmec: table5: params.uav_battery_j is -1"),
+        (["run", "table5", "--set", "nonsense"], "uavmec: --set nonsense: give NAME=VALUE"),
+        (
+            ["run", "table5", "--set", "steps=10000000000", "--set", "dqn.replay_capacity=10000000000"],
+            "uavmec: table5: steps",
+        ),
+        (["validate", "broken.toml"], "uavmec: broken.toml: not TOML"),
+        (["show", "."], "uavmec: .: holds no run"),
+    ],
+    ids=lambda value: value[-1] if isinstance(value, list) else "",
+)
+def test_bad_input_is_one_line_and_exit_code_2(tmp_path, arguments, line):
+    (tmp_path / "broken.toml").write_text("steps = = 1")
+    done = uavmec(*arguments, cwd=tmp_path, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith(line)
+    assert done.stderr.count("\n") == 1
+    assert [file.name for file in tmp_path.iterdir()] == ["broken.toml"]  # nothing was written
+
+
+def test_folder_with_a_run_is_refused(run_directory):
+    directory, _ = run_directory
+    done = uavmec("run", "table5", "--out", directory, check=False)
+    assert (done.returncode, done.stderr) == (
+        2,
+        f"uavmec: {directory}: already holds a run; give another folder with --out\n",
+    )
+
+
+@pytest.mark.slow
+def test_ctrl_c_says_what_is_kept(tmp_path):
+    (tmp_path / "my.toml").write_text(TOML.replace("400", "100000000"))
+    command = [
+        sys.executable,
+        "-m",
+        "uavmec_jax",
+        "run",
+        "my.toml",
+        "--out",
+        "out",
+        "--set",
+        "dqn.replay_capacity=1000",
+    ]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        time.sleep(25)
+        os.kill(process.pid, signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "interrupted: no block was finished, nothing was kept" in errors
+    assert not (Path(tmp_path) / "out").exists()

@@ -1,0 +1,21 @@
+"""Small worlds whose numbers can be worked out by hand."""
+
+import jax.numpy as jnp
+
+from uavmec_jax.world.layout import Layout
+
+
+def three_devices(has_power=(False, False, False), has_comms=(False, False, False), **changes) -> Layout:
+    """Device 0 is 50 m from the origin, device 1 is 60 m north of it (co-served), device 2 is far away."""
+    fields = {
+        "position": jnp.array([[30.0, 40.0], [30.0, 100.0], [330.0, 440.0]]),
+        "device_type": jnp.zeros(3, jnp.int32),
+        "task": jnp.zeros(3, jnp.int32),
+        "capacity": jnp.array([60_000.0, 60_000.0, 60_000.0]),
+        "has_power": jnp.array(has_power),
+        "has_comms": jnp.array(has_comms),
+        "standby_power": jnp.array([2.0, 3.0, 4.0]),
+        "active_power": jnp.array([1.0, 1.5, 2.5]),
+        "processing_rate": jnp.array([10_000.0, 10_000.0, 10_000.0]),
+    }
+    return Layout(**{**fields, **changes})
