@@ -1,5 +1,6 @@
 """The DQN: schedules, one update against NumPy, and what an agent may not do."""
 
+import functools
 import itertools
 
 import jax
@@ -18,13 +19,21 @@ SPEC = DQNSpec(total_steps=20_000)
 HYPER = DQNHyper()
 
 
+@functools.cache
+def programs(spec):
+    """Jitted ``init`` and ``update`` of a population, compiled once for each number of agents."""
+    over = lambda f, *axes: jax.jit(jax.vmap(f, axes, axis_name=AGENTS_AXIS))  # noqa: E731
+    return over(functools.partial(dqn.init, spec), 0), over(functools.partial(dqn.update, spec), 0, 0, None, None)
+
+
 def train(spec, agents, *bounds, state=None):
-    """A population through the iterations between the given bounds."""
-    over = lambda f, axes: jax.vmap(f, axes, axis_name=AGENTS_AXIS)  # noqa: E731
-    state = over(lambda a: dqn.init(spec, a), (0,))(agents) if state is None else state
-    update = jax.jit(over(lambda a, s, first, last: dqn.update(spec, a, s, first, last), (0, 0, None, None)))
+    """A population of up to four agents through the iterations between the given bounds."""
+    init, update = programs(spec)
+    places = np.arange(4) % agents.key.shape[0]
+    padded = jax.tree.map(lambda leaf: leaf[places], agents)
+    state = init(padded) if state is None else state
     for first, last in itertools.pairwise(bounds):
-        state = update(agents, state, first, last)
+        state = update(padded, state, first, last)
     return state
 
 
@@ -159,7 +168,9 @@ def test_batched_agent_is_the_agent_alone():
     agents = [make_agent(i, powered=4 + 2 * i, **hyper) for i, hyper in enumerate(hypers)]
     together = train(SPEC, stack(agents), 0, 250)
     for i, agent in enumerate(agents):
-        alone = train(SPEC, stack([agent]), 0, 250)
+        init, update = programs(SPEC)  # train() would pad
+        population = stack([agent])
+        alone = update(population, init(population), 0, 250)
         assert_array_equal(alone.rows[0, :, -1], together.rows[i, :, -1])  # the same actions and ends
         for a, b in zip(*map(jax.tree.leaves, (alone.weights, together.weights)), strict=True):
             assert_allclose(a[0], b[i], rtol=1e-3, atol=1e-4)
@@ -172,7 +183,7 @@ def test_diverged_agent_is_frozen_marked_and_touches_nobody(bad):
     sound = [make_agent(0), make_agent(1), make_agent(2)]
     state = train(SPEC, stack([sound[0], make_agent(1, **bad), sound[2]]), 0, 200)
     without = train(SPEC, stack(sound), 0, 200)
-    assert_array_equal(state.diverged_at, [-1, 104, -1])
+    assert_array_equal(state.diverged_at[:3], [-1, 104, -1])
     for leaf, other in zip(*map(jax.tree.leaves, (state.weights, without.weights)), strict=True):
         assert np.isfinite(leaf).all()
         assert_array_equal(leaf[jnp.array([0, 2])], other[jnp.array([0, 2])])

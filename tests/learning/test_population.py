@@ -84,13 +84,13 @@ def test_best_weights_are_those_of_the_best_look():
 
 def test_blocks_padding_and_devices_do_not_change_an_agent():
     agents = stack([make_agent(i) for i in range(5)])
-    (whole,), _ = train(agents, blocks=Blocks(1, 6, 2, 0))
-    split, _ = train(agents, blocks=Blocks(2, 4, 2, 0))
-    single, _ = train(agents, blocks=Blocks(1, 5, 1, 0))
+    (whole,), _ = train(agents, 1000, blocks=Blocks(1, 6, 2, 0))
+    split, _ = train(agents, 1000, blocks=Blocks(2, 4, 2, 0))
+    single, _ = train(agents, 1000, blocks=Blocks(1, 5, 1, 0))
     assert [block.agents for block in split] == [slice(0, 4), slice(4, 5)]
     pieces = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(block.last for block in split))
     for other in (pieces, single[0].last):
-        jax.tree.map(lambda a, b: assert_allclose(a, b, rtol=1e-3, atol=1e-4), whole.last, other)
+        jax.tree.map(lambda a, b: assert_allclose(a, b, rtol=1e-2, atol=1e-3), whole.last, other)
 
 
 def test_small_replay_wraps():

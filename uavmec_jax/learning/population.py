@@ -227,7 +227,7 @@ def _compiler_options() -> dict[str, bool]:
     return {"xla_cpu_enable_concurrency_optimized_scheduler": False} if jax.default_backend() == "cpu" else {}
 
 
-def _look(algorithm: Algorithm, agent: Agent, keys: Key[Array, "B D"], weights: Any, best: Best, step: Any) -> Any:
+def _look(algorithm: Algorithm, agent: Agent, keys: Key[Array, " D"], weights: Any, best: Best, step: Any) -> Any:
     """Mean validation lifetime of the greedy policy of one agent, and the best so far (ties keep the earlier)."""
     scenario = agent.scenario
     policy = algorithm.policy(agent.hyper, weights)
