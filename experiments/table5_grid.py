@@ -31,7 +31,8 @@ def main() -> None:
     results = run_study(study, arguments.out)
     figures.save(figures.grid_figure(results), arguments.out / "figure.png")
     console = Console()
-    for table in tables.tables(results):
+    for title, table in tables.tables(results).items():
+        console.print(title)
         console.print(table)
 
 

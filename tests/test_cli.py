@@ -9,6 +9,9 @@ import time
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
+
+from uavmec_jax.cli import main
 
 TOML = """
 steps = 400
@@ -47,7 +50,7 @@ def test_help_does_not_import_jax():
     assert "run table5 --quick" in done.stdout
     assert done.stdout.strip().endswith("False")
     for command in ("run", "show", "validate", "doctor"):
-        assert "Usage" in uavmec(command, "--help").stdout
+        assert "Usage" in CliRunner().invoke(main, [command, "--help"]).stdout
 
 
 def test_run_prints_the_tables_and_leaves_the_files(run_directory):
@@ -72,10 +75,10 @@ def test_run_prints_the_tables_and_leaves_the_files(run_directory):
 
 def test_show_prints_the_same_tables(run_directory):
     directory, done = run_directory
-    shown = uavmec("show", directory)
+    shown = CliRunner().invoke(main, ["show", str(directory)])
     table = done.stdout[done.stdout.index("Lifetime") : done.stdout.index("Files:")]
     assert table in shown.stdout
-    cells = json.loads(uavmec("show", directory, "--json").stdout)["cells"]
+    cells = json.loads(CliRunner().invoke(main, ["show", str(directory), "--json"]).stdout)["cells"]
     assert [(cell["powered"], cell["connected"], cell["seeds"]) for cell in cells] == [(12, 8, 2), (8, 8, 2)]
     assert {"best", "best_low", "best_high", "last", "oldest_first", "best_first_device"} <= cells[0].keys()
 
@@ -83,18 +86,19 @@ def test_show_prints_the_same_tables(run_directory):
 def test_resolved_study_runs_again(run_directory, tmp_path):
     directory, _ = run_directory
     done = uavmec("run", directory / "study.toml", "--out", tmp_path / "again", "--json")
-    first = json.loads(uavmec("show", directory, "--json").stdout)
+    first = json.loads(CliRunner().invoke(main, ["show", str(directory), "--json"]).stdout)
     again = json.loads(done.stdout)
     assert again["cells"] == first["cells"]
 
 
 def test_validate_and_doctor(run_directory, tmp_path):
-    assert "table5: a valid study: 250 agents x 1,000,000 steps" in uavmec("validate", "table5").stdout
-    assert json.loads(uavmec("validate", "table5", "--json").stdout)["steps"] == 1_000_000
+    assert (
+        "table5: a valid study: 250 agents x 1,000,000 steps" in CliRunner().invoke(main, ["validate", "table5"]).stdout
+    )
+    assert json.loads(CliRunner().invoke(main, ["validate", "table5", "--json"]).stdout)["steps"] == 1_000_000
     facts = json.loads(uavmec("doctor", "--json").stdout)
     assert facts["environment_steps_per_second"] > 10_000
     assert facts["devices"]
-    assert "jax" in uavmec("doctor").stdout
 
 
 @pytest.mark.parametrize(
@@ -119,13 +123,24 @@ def test_validate_and_doctor(run_directory, tmp_path):
     ],
     ids=lambda value: value[-1] if isinstance(value, list) else "",
 )
-def test_bad_input_is_one_line_and_exit_code_2(tmp_path, arguments, line):
+def test_bad_input_is_one_line_and_exit_code_2(tmp_path, monkeypatch, arguments, line):
     (tmp_path / "broken.toml").write_text("steps = = 1")
-    done = uavmec(*arguments, cwd=tmp_path, check=False)
-    assert done.returncode == 2
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(main, arguments)
+    assert done.exit_code == 2
     assert done.stderr.startswith(line)
     assert done.stderr.count("\n") == 1
     assert [file.name for file in tmp_path.iterdir()] == ["broken.toml"]  # nothing was written
+
+
+def test_bad_input_from_a_subprocess(tmp_path):
+    done = uavmec("run", "table5", "--set", "axes.connected=[13]", cwd=tmp_path, check=False)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr == (
+        "uavmec: table5: axes.connected has 13; give whole numbers from 0 to 12, the number of devices\n"
+    )
+    assert not list(tmp_path.iterdir())
 
 
 def test_folder_with_a_run_is_refused(run_directory):

@@ -172,7 +172,8 @@ def _print(results: Any, directory: Path, console: Any, as_json: bool) -> None:
         cells = json.loads(results.cells().to_json(orient="records"))
         click.echo(json.dumps({"directory": str(directory), "run": results.run, "cells": cells}, indent=1))
         return
-    for table in tables(results):
+    for title, table in tables(results).items():
+        console.print(f"[bold]{title}[/bold]")
         console.print(table)
     for line in summary(results):
         console.print(line, highlight=False)

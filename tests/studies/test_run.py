@@ -10,7 +10,7 @@ from numpy.testing import assert_array_equal
 from uavmec_jax.reporting import figures, tables
 from uavmec_jax.studies import host
 from uavmec_jax.studies.results import load_results, load_weights
-from uavmec_jax.studies.run import check_directory, plan_study, run_study
+from uavmec_jax.studies.run import _BYTES_WITHOUT_TRAINING, check_directory, plan_study, run_study
 from uavmec_jax.studies.schema import StudyError
 from uavmec_jax.studies.study import parse_study
 
@@ -86,6 +86,8 @@ def test_cells_are_means_over_seeds(finished):
     values = results.agents.query("powered == 4 and connected == 12")["best_lifetime"]
     assert cell["best"] == values.mean()
     assert cell["best_low"] <= cell["best"] <= cell["best_high"]
+    paired = values - results.agents.query("powered == 4 and connected == 12")["oldest_first_lifetime"]
+    assert cell["best_over_oldest"] == paired.mean()
     share = results.first_failures("best")
     assert share.shape == (8, 12)
     assert ((share.sum(axis=1) < 1.0001) & (share >= 0).all(axis=1)).all()
@@ -93,7 +95,7 @@ def test_cells_are_means_over_seeds(finished):
 
 def test_tables_and_figures(finished, tmp_path):
     results, _ = finished
-    assert len(tables.tables(results)) == 3
+    assert len(tables.tables(results)) == 4
     assert "Mean over 4 cells" in tables.summary(results)[0]
     for figure in (figures.run_figure(results), figures.curves_figure(results)):
         figures.save(figure, tmp_path / "figure.png")
@@ -104,16 +106,22 @@ def test_other_axes_make_a_list():
     study = parse_study(TOML, "tiny", {"axes.gamma": [0.9, 0.98], "axes.powered": [8], "axes.seeds": 1})
     results = run_study(study)
     assert len(results.cells()) == 4
-    (table,) = tables.tables(results)
+    (table,) = tables.tables(results).values()
     assert table.row_count == 4
     assert tables.summary(results)
     assert figures.run_figure(results)
 
 
+def leave_room_for(agents, study, monkeypatch):
+    """Pretend that the host has memory for so many agents in training."""
+    plan = plan_study(study)
+    free = _BYTES_WITHOUT_TRAINING * plan.agents + agents * plan.blocks.bytes // plan.blocks.size
+    monkeypatch.setattr(host, "free_memory", lambda: free)
+
+
 def test_blocks_one_after_the_other_give_every_agent_once(finished, monkeypatch):
     study = finished[0].study
-    per_agent = plan_study(study).blocks.bytes // plan_study(study).blocks.size
-    monkeypatch.setattr(host, "free_memory", lambda: 2 * per_agent + 1_000_000)
+    leave_room_for(2, study, monkeypatch)
     assert plan_study(study).blocks.count == 4
     pieces = run_study(study)
     assert pieces.run["complete"]
@@ -124,8 +132,7 @@ def test_blocks_one_after_the_other_give_every_agent_once(finished, monkeypatch)
 
 def test_interrupted_run_keeps_the_finished_blocks(finished, monkeypatch, tmp_path):
     study = finished[0].study
-    per_agent = plan_study(study).blocks.bytes // plan_study(study).blocks.size
-    monkeypatch.setattr(host, "free_memory", lambda: 4 * per_agent + 1_000_000)
+    leave_room_for(4, study, monkeypatch)
     assert plan_study(study).blocks.count == 2
 
     def interrupt(progress):

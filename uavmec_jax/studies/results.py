@@ -49,6 +49,11 @@ class Results:
         """Policies in the table, as in its column names."""
         return [name.removesuffix("_lifetime") for name in self.agents.columns if name.endswith("_lifetime")]
 
+    @property
+    def _over_oldest(self) -> list[str]:
+        """Learned policies to be held against oldest-first, layout by layout."""
+        return [name for name in ("best", "last") if {name, "oldest_first"} <= set(self.policies)]
+
     def add(self, rows: pd.DataFrame, curves: Mapping, evaluation: Mapping, weights: Mapping[str, Any]) -> None:
         """Append the agents of one more block."""
         flat = traverse_util.flatten_dict(dict(weights), sep="/")
@@ -59,7 +64,7 @@ class Results:
                 mine[name] = np.concatenate([mine[name], values]) if name in mine and not shared else np.asarray(values)
 
     def cells(self) -> pd.DataFrame:
-        """One row per cell: mean, interval and spread of every policy over the seeds, and who fails first."""
+        """One row per cell: means and intervals over the seeds, paired differences to oldest-first, who fails first."""
         rows = []
         for cell, group in self.agents.groupby(cell_axes(self.study), sort=False):
             row: dict[str, Any] = dict(zip(cell_axes(self.study), cell, strict=True)) | {"seeds": len(group)}
@@ -70,6 +75,10 @@ class Results:
                 share = self.first_failures(policy)[group.index].mean(axis=0)
                 row[f"{policy}_first_device"] = int(share.argmax()) + 1 if share.max() > 0 else 0
                 row[f"{policy}_first_share"] = float(share.max())
+            for policy in self._over_oldest:
+                paired = (group[f"{policy}_lifetime"] - group["oldest_first_lifetime"]).to_numpy()
+                names = (f"{policy}_over_oldest", f"{policy}_over_oldest_low", f"{policy}_over_oldest_high")
+                row |= dict(zip(names, mean_interval(paired), strict=True))
             rows.append(row)
         return pd.DataFrame(rows)
 
@@ -118,7 +127,7 @@ def load_results(directory: str | Path) -> Results:
         raise StudyError(f"{directory}: holds no run ({_RUN} is not there)")
     try:
         run = json.loads((directory / _RUN).read_text(encoding="utf-8"))
-        agents = pd.read_csv(directory / _AGENTS)
+        agents = _read_table(directory / _AGENTS)
     except (OSError, ValueError) as error:
         raise StudyError(f"{directory}: cannot be read: {error}") from None
     if run.get("schema", SCHEMA) > SCHEMA:
@@ -130,6 +139,12 @@ def load_results(directory: str | Path) -> Results:
         curves=_load_arrays(directory / _CURVES),
         evaluation=_load_arrays(directory / _EVALUATION),
     )
+
+
+def _read_table(path: Path) -> pd.DataFrame:
+    """The tidy table; lists of device numbers stay text, also where they are empty or one number."""
+    lists = {name: str for name in pd.read_csv(path, nrows=0).columns if name.endswith("_devices_fixed")}
+    return pd.read_csv(path, dtype=lists, keep_default_na=False)
 
 
 def load_weights(directory: str | Path, which: str = "best") -> dict[str, Any]:
@@ -151,7 +166,7 @@ def _save_arrays(file: IO[bytes], arrays: dict[str, Any]) -> None:
 
 def _load_arrays(path: Path) -> dict[str, np.ndarray]:
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
     except (OSError, ValueError, zipfile.BadZipFile) as error:
         raise StudyError(f"{path}: cannot be read: {error}") from None

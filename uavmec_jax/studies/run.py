@@ -52,14 +52,14 @@ def plan_study(study: Study) -> Plan:
         StudyError: the population does not fit in memory.
     """
     algorithm, agents, free = make_algorithm(study), n_agents(study), host.free_memory()
-    if agents * _BYTES_WITHOUT_TRAINING > free:
-        needed = agents * _BYTES_WITHOUT_TRAINING
+    needed = agents * _BYTES_WITHOUT_TRAINING
+    if needed > free:
         raise StudyError(
             f"{study.name}: {agents:,} agents need {needed / 2**30:,.0f} GiB before any of them trains, "
             f"{free / 2**30:.1f} GiB are free; shorten an axis"
         )
     try:
-        blocks = population.plan_blocks(agents, algorithm.agent_bytes, free)
+        blocks = population.plan_blocks(agents, algorithm.agent_bytes, free - needed)
     except PopulationTooLargeError as error:
         raise StudyError(f"{study.name}: steps is {study.steps}: {error}") from None
     return Plan(agents=agents, total_steps=agents * algorithm.total_steps, blocks=blocks, free_bytes=free)
