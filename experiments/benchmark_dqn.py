@@ -26,7 +26,8 @@ def train_speed(n_agents: int, seconds: float) -> dict:
     from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
     from uavmec_jax.learning.algorithm import AGENTS_AXIS
-    from uavmec_jax.learning.population import Programs, plan_blocks
+    from uavmec_jax.learning.blocks import plan_blocks
+    from uavmec_jax.learning.population import Programs
     from uavmec_jax.studies import host
     from uavmec_jax.studies.study import make_agents, make_algorithm, parse_study, validation_keys
 
@@ -173,7 +174,7 @@ def main() -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from uavmec_jax.learning.population import AGENTS_PER_CORE
+    from uavmec_jax.learning.blocks import AGENTS_PER_CORE
     from uavmec_jax.studies.speed import environment_speed
 
     facts = host.describe()

@@ -7,8 +7,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from tests.learning.agents import make_agent, stack
 from uavmec_jax.learning import dqn, population
+from uavmec_jax.learning.blocks import Blocks, PopulationTooLargeError, plan_blocks
 from uavmec_jax.learning.dqn import DQNSpec
-from uavmec_jax.learning.population import Blocks, PopulationTooLargeError, Validation, plan_blocks
+from uavmec_jax.learning.population import Validation
 from uavmec_jax.planning.heuristics import HEURISTICS
 from uavmec_jax.world.rollout import rollouts
 

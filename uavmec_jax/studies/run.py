@@ -13,7 +13,8 @@ import pandas as pd
 
 from uavmec_jax.learning import population
 from uavmec_jax.learning.algorithm import Agent, Algorithm
-from uavmec_jax.learning.population import Blocks, PopulationTooLargeError, Progress, TrainedBlock, Validation
+from uavmec_jax.learning.blocks import Blocks, PopulationTooLargeError, plan_blocks
+from uavmec_jax.learning.population import Progress, TrainedBlock, Validation
 from uavmec_jax.studies import host
 from uavmec_jax.studies.evaluation import judge
 from uavmec_jax.studies.results import SCHEMA, Results, holds_run
@@ -59,7 +60,7 @@ def plan_study(study: Study) -> Plan:
             f"{free / 2**30:.1f} GiB are free; shorten an axis"
         )
     try:
-        blocks = population.plan_blocks(agents, algorithm.agent_bytes, free - needed)
+        blocks = plan_blocks(agents, algorithm.agent_bytes, free - needed)
     except PopulationTooLargeError as error:
         raise StudyError(f"{study.name}: steps is {study.steps}: {error}") from None
     return Plan(agents=agents, total_steps=agents * algorithm.total_steps, blocks=blocks, free_bytes=free)
