@@ -83,6 +83,7 @@ def test_show_prints_the_same_tables(run_directory):
     assert {"best", "best_low", "best_high", "last", "oldest_first", "best_first_device"} <= cells[0].keys()
 
 
+@pytest.mark.slow
 def test_resolved_study_runs_again(run_directory, tmp_path):
     directory, _ = run_directory
     done = uavmec("run", directory / "study.toml", "--out", tmp_path / "again", "--json")

@@ -102,6 +102,7 @@ def test_tables_and_figures(finished, tmp_path):
         assert (tmp_path / "figure.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_other_axes_make_a_list():
     study = parse_study(TOML, "tiny", {"axes.gamma": [0.9, 0.98], "axes.powered": [8], "axes.seeds": 1})
     results = run_study(study)
@@ -119,6 +120,7 @@ def leave_room_for(agents, study, monkeypatch):
     monkeypatch.setattr(host, "free_memory", lambda: free)
 
 
+@pytest.mark.slow
 def test_blocks_one_after_the_other_give_every_agent_once(finished, monkeypatch):
     study = finished[0].study
     leave_room_for(2, study, monkeypatch)
