@@ -17,12 +17,14 @@ compute 10,000 bytes/s. Unless said otherwise the UAV flies from the origin to d
   battery 2     60,000 - (4 * 300 + 2.5 * 300)      = 58,050 J
 """
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from tests.worlds import three_devices
+from uavmec_jax.world import physics
 from uavmec_jax.world.params import Params
 from uavmec_jax.world.physics import Cause, State, initial_state, transition, upload_rate
 
@@ -65,7 +67,14 @@ def test_shannon_rate():
 
 def test_shannon_rate_of_a_weak_signal():
     # slant 3000 m: gain 1e-5 / 8.1e13, snr 1.234568e-7; log2(1 + snr) = snr / ln 2 = 1.781105e-7 (1 + 1.2e-7 is lost in f32)
-    assert_allclose(upload_rate(Params(), jnp.array([3000.0])), [2e7 * 1.781105e-7], rtol=1e-5)
+    for rate in (upload_rate, jax.jit(upload_rate)):
+        assert_allclose(rate(Params(), jnp.array([3000.0])), [2e7 * 1.781105e-7], rtol=1e-5)
+
+
+def test_log1p_is_accurate_over_the_whole_range():
+    x = np.float32(10 ** np.linspace(-12, 6, 2000))
+    for log1p in (physics._log1p, jax.jit(physics._log1p)):
+        assert_allclose(log1p(jnp.asarray(x)), np.log1p(x.astype(float)), rtol=4e-7)
 
 
 def test_staying_flies_nowhere():
