@@ -147,8 +147,8 @@ def test_interrupted_run_keeps_the_finished_blocks(finished, monkeypatch, tmp_pa
 
 
 def test_run_that_does_not_fit_is_refused_before_anything_is_written(finished, monkeypatch, tmp_path):
-    with pytest.raises(StudyError, match=r"tiny: steps is 10000000000: one agent needs"):
-        run_study(parse_study(TOML, "tiny", {"steps": 10**10, "dqn.replay_capacity": 10**10}), tmp_path / "big")
+    with pytest.raises(StudyError, match=r"tiny: steps is 2000000000: one agent needs"):
+        run_study(parse_study(TOML, "tiny", {"steps": 2 * 10**9, "dqn.replay_capacity": 2 * 10**9}), tmp_path / "big")
     with pytest.raises(StudyError, match=r"8,000,000,000 agents need .* GiB before any of them trains"):
         plan_study(parse_study(TOML, "tiny", {"axes.seeds": 2 * 10**9}))
     assert not (tmp_path / "big").exists()

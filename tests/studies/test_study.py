@@ -86,12 +86,15 @@ def test_draws_for_training_validation_and_evaluation_are_different():
 
 def test_scenario_parameters_and_devices_are_settings():
     study = parse_study(
-        SMALL, "x", {"params.n_devices": 20, "params.region_m": [400.0, 300.0], "axes.uav_speed_m_s": [5.0, 10.0]}
+        SMALL, "x", {"params.n_devices": 20, "params.region_m": [400.0, 300.0], "axes.uav_speed_m_s": [5, 10]}
     )
     agents = make_agents(study)
     assert agents.scenario.layout.position.shape == (8, 20, 2)
     assert agents.scenario.layout.position[..., 1].max() <= 300
     assert_array_equal(agents.scenario.params.uav_speed_m_s, [5, 10] * 4)
+    assert (
+        agents.scenario.params.uav_speed_m_s.dtype == np.float32
+    )  # whole numbers in the file, real ones in the program
 
 
 BAD = [
@@ -118,6 +121,8 @@ BAD = [
     ({"axes.connected": [True]}, "bad.toml: axes.connected has True; give whole numbers"),
     ({"axes.powered": []}, "bad.toml: axes.powered is empty; give at least one value"),
     ({"axes.powered": [4, 4]}, "bad.toml: axes.powered repeats a value"),
+    ({"axes.powered": [[4]]}, "bad.toml: axes.powered has [4]; give whole numbers"),
+    ({"steps": 3_000_000_000}, "bad.toml: steps is 3000000000; it should be less than or equal to 2000000000"),
     ({"axes.powered": 8}, "bad.toml: axes.powered is 8; give a list"),
     ({"axes.seeds": 0}, "bad.toml: axes.seeds is 0; give at least 1 seed"),
     ({"axes.seeds": [-3]}, "bad.toml: axes.seeds has -3"),

@@ -89,7 +89,7 @@ class Study(Strict):
     algorithm: Literal["dqn"] = "dqn"
     reward: str | dict[str, float] = DEFAULT_REWARD
     guard: Literal["clamp", "log1p"] = "clamp"
-    steps: Annotated[int, Field(ge=1)] = 1_000_000
+    steps: Annotated[int, Field(ge=1, le=2_000_000_000)] = 1_000_000
     """Environment steps of one agent."""
     axes: dict[str, Any]
     """``powered``, ``connected``, ``seeds`` (a number or a list), ``reward``, ``guard``, any traced setting."""
@@ -129,17 +129,17 @@ def _check_axes(study: Study) -> None:
         if name not in known:
             raise ValueError(f"{where} is not an axis; {nearest(name, known)}")
         if name == "seeds" and isinstance(values, int) and not isinstance(values, bool):
-            if values < 1:
-                raise ValueError(f"{where} is {values}; give at least 1 seed")
+            if not 1 <= values < 2**31:
+                raise ValueError(f"{where} is {values}; give at least 1 seed, and fewer than 2**31")
             continue
         if not isinstance(values, list):
             raise ValueError(f"{where} is {values!r}; give a list{' or a number' * (name == 'seeds')}")
         if not values:
             raise ValueError(f"{where} is empty; give at least one value")
-        if len(set(values)) < len(values):
-            raise ValueError(f"{where} repeats a value: {values}")
         for value in values:
             _check_value(study, name, where, value)
+        if len(set(values)) < len(values):
+            raise ValueError(f"{where} repeats a value: {values}")
 
 
 def _check_value(study: Study, name: str, where: str, value: Any) -> None:

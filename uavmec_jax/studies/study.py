@@ -158,8 +158,8 @@ def make_agents(study: Study) -> Agent:
     seeds, powered, connected = (_column(who, name) for name in ("seed", "powered", "connected"))
 
     def leaf(name: str, default: Any) -> Any:
-        values = [agent.get(name, default) for agent in who]
-        return jnp.asarray(values, jnp.int32 if isinstance(default, int) and not isinstance(default, bool) else None)
+        dtype = {bool: jnp.bool_, int: jnp.int32}.get(type(default), jnp.float32)
+        return jnp.asarray([agent.get(name, default) for agent in who], dtype)
 
     def spread(name: str, value: Any) -> Any:
         if isinstance(value, tuple):

@@ -1,0 +1,41 @@
+"""The experiment scripts run from the clone, small."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXPERIMENTS = Path(__file__).parents[1] / "experiments"
+
+pytestmark = pytest.mark.slow
+
+
+def run(script, *arguments):
+    done = subprocess.run(
+        [sys.executable, EXPERIMENTS / script, *map(str, arguments)], capture_output=True, text=True, timeout=500
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_table5_grid(tmp_path):
+    out = run("table5_grid.py", "--seeds", 1, "--steps", 400, "--out", tmp_path / "grid")
+    assert "Lifetime in slots" in out
+    assert (tmp_path / "grid" / "figure.png").exists()
+
+
+def test_figure3_training(tmp_path):
+    run("figure3_training.py", "--steps", 60_000, "--out", tmp_path)
+    assert (tmp_path / "figure3.png").stat().st_size > 20_000
+    assert {folder.name for folder in tmp_path.iterdir() if folder.is_dir()} == {"learning-rates", "short", "seeds"}
+
+
+def test_benchmark_dqn(tmp_path):
+    out = run("benchmark_dqn.py", "--seconds", 0.3, "--out", tmp_path)
+    assert "environment alone" in out
+    report = json.loads((tmp_path / "benchmark_dqn.json").read_text())
+    assert [row["agents"] for row in report["training"]] == [1, 8, 75, 300]
+    assert all(row["steps_per_second"] > 0 for row in report["training"])
+    assert report["ceiling"] > 0
