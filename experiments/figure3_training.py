@@ -15,6 +15,7 @@ from uavmec_jax.studies import host
 host.use_every_core()
 
 import numpy as np  # noqa: E402
+import pandas as pd  # noqa: E402
 
 from uavmec_jax.reporting import figures  # noqa: E402
 from uavmec_jax.studies.results import Results  # noqa: E402
@@ -37,8 +38,8 @@ def draw(axis: object, results: Results, agent: int, label: str) -> None:
         np.nanmean(curves["episode_length"][agent, end - n : end]) for end, n in zip(ends, per_look, strict=True)
     ]
     (line,) = axis.plot(curves["look_steps"], training, lw=0.8, alpha=0.5)
-    smooth = np.convolve(curves["validation"][agent], np.ones(5) / 5, mode="valid")
-    axis.plot(curves["look_steps"][2:-2], smooth, lw=1.8, color=line.get_color(), label=label)
+    smooth = pd.Series(curves["validation"][agent]).rolling(5, center=True, min_periods=1).mean()
+    axis.plot(curves["look_steps"], smooth, lw=1.8, color=line.get_color(), label=label)
 
 
 def main() -> None:
