@@ -20,7 +20,7 @@ from uavmec_jax.learning import replay
 from uavmec_jax.learning.algorithm import AGENTS_AXIS, Agent, Algorithm
 from uavmec_jax.learning.networks import QNetwork
 from uavmec_jax.learning.optimizers import MAX_LEARNING_RATE, clipped_adam, global_norm
-from uavmec_jax.world.environment import advance, draw_volumes, is_truncated, observe
+from uavmec_jax.world.environment import advance, draw_volumes, is_truncated, observe, restart_if
 from uavmec_jax.world.layout import Layout
 from uavmec_jax.world.params import Params
 from uavmec_jax.world.physics import Cause, State, initial_state
@@ -246,10 +246,9 @@ def _act(
     terminated = outcome.cause != Cause.NONE
     ended = terminated | is_truncated(scenario, after, outcome)
     row = replay.pack(spec.replay, action, reward, after.battery / layout.capacity, after.age, terminated, ended)
-    fresh = initial_state(scenario.params, layout)
     state = replace(
         state,
-        world=jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, after),
+        world=restart_if(ended, scenario, after),
         episode_slots=state.episode_slots + jnp.where(ended, after.slot, 0),
         episodes=state.episodes + ended,
     )

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
-from uavmec_jax.world.environment import Scenario, advance, draw_volumes, make_scenario
+from uavmec_jax.world.environment import Scenario, advance, draw_volumes, make_scenario, restart_if
 from uavmec_jax.world.layout import sample_layout
 from uavmec_jax.world.params import Params
 from uavmec_jax.world.physics import Cause, State, initial_state
@@ -24,9 +24,7 @@ def random_steps(scenario: Scenario, state: State, key: Any, steps: Any) -> tupl
         uniform = jax.random.uniform(jax.random.fold_in(key, i), (n + 1,))
         action = jnp.minimum((uniform[n] * n).astype(jnp.int32), n - 1)
         after, reward, outcome = advance(scenario, state, action, draw_volumes(scenario.params, uniform[:n]))
-        fresh = initial_state(scenario.params, scenario.layout)
-        ended = outcome.cause != Cause.NONE
-        return jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, after), total + reward
+        return restart_if(outcome.cause != Cause.NONE, scenario, after), total + reward
 
     return jax.lax.fori_loop(0, steps, step, (state, jnp.float32(0)))
 

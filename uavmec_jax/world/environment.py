@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from uavmec_jax.world.layout import Layout, sample_layout
 from uavmec_jax.world.params import Params
@@ -54,6 +54,12 @@ def advance(
 def is_truncated(scenario: Scenario, state: State, outcome: Outcome) -> Array:
     """Whether the time limit, and nothing else, ends the episode here."""
     return (outcome.cause == Cause.NONE) & (state.slot >= scenario.params.max_slots)
+
+
+def restart_if(ended: Bool[Array, ""], scenario: Scenario, state: State) -> State:
+    """The state an episode goes on from: a fresh one where it has ended."""
+    fresh = initial_state(scenario.params, scenario.layout)
+    return jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, state)
 
 
 class UavMecEnv:
@@ -106,9 +112,7 @@ class UavMecEnv:
         terminated = outcome.cause != Cause.NONE
         truncated = is_truncated(scenario, after, outcome)
         final_observation = observe(layout, after)
-        fresh = initial_state(scenario.params, layout)
-        done = terminated | truncated
-        next_state = jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, after)
+        next_state = restart_if(terminated | truncated, scenario, after)
         info = {
             "terminated": terminated,
             "truncated": truncated,
@@ -120,5 +124,4 @@ class UavMecEnv:
             "first_failure": outcome.first_failure,
             "length": after.slot,
         }
-        observation = jnp.where(done, observe(layout, fresh), final_observation)
-        return observation, next_state, reward, terminated, truncated, info
+        return observe(layout, next_state), next_state, reward, terminated, truncated, info

@@ -5,6 +5,7 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
@@ -138,13 +139,7 @@ def transition(
         slot=state.slot + 1,
     )
     unstarted = replace(state, slot=state.slot + jnp.where(params.count_unfinished_slot, 1, 0))
-    after = State(
-        battery=jnp.where(starts, after.battery, unstarted.battery),
-        age=jnp.where(starts, after.age, unstarted.age),
-        uav_position=jnp.where(starts, after.uav_position, unstarted.uav_position),
-        uav_energy=jnp.where(starts, after.uav_energy, unstarted.uav_energy),
-        slot=jnp.where(starts, after.slot, unstarted.slot),
-    )
+    after = jax.tree.map(lambda played, kept: jnp.where(starts, played, kept), after, unstarted)
     empty = starts & (after.battery <= 0.0)
     return after, _outcome(params, state, after, starts, served, duration, drain, empty)
 
