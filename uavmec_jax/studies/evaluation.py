@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -79,27 +80,8 @@ def judge(
         weights: name -> trained weights, leaves ``[A, ...]``.
         baselines: names in :data:`HEURISTICS`.
     """
-
-    @jax.jit
-    def play_learned(agents: Agent, keys: Key[Array, "A D"], weights: Any) -> Episode:
-        def one(agent: Agent, draws: Key[Array, " D"], weights: Any) -> Episode:
-            policy = algorithm.policy(agent.hyper, weights)
-            return rollouts(policy, agent.scenario.params, agent.scenario.layout, draws)
-
-        return jax.vmap(one)(agents, keys, weights)
-
-    names = tuple(baselines)
-
-    @jax.jit
-    def play_baselines(agents: Agent, keys: Key[Array, "A D"]) -> dict[str, Episode]:
-        def one(agent: Agent, draws: Key[Array, " D"]) -> dict[str, Episode]:
-            world = (agent.scenario.params, agent.scenario.layout, draws)
-            return {name: rollouts(HEURISTICS[name], *world) for name in names}
-
-        return jax.vmap(one)(agents, keys)
-
-    episodes = {name: play_learned(agents, keys, trained) for name, trained in weights.items()}
-    episodes |= play_baselines(agents, keys)
+    episodes = {name: _play_learned(algorithm, agents, keys, trained) for name, trained in weights.items()}
+    episodes |= _play_baselines(tuple(baselines), agents, keys)
     return {
         name: Judgement(
             lifetime=np.asarray(episode.length),
@@ -108,3 +90,22 @@ def judge(
         )
         for name, episode in episodes.items()
     }
+
+
+# Jitted here and not inside `judge`, so that the blocks of a run share one compilation.
+@partial(jax.jit, static_argnames="algorithm")
+def _play_learned(algorithm: Algorithm, agents: Agent, keys: Key[Array, "A D"], weights: Any) -> Episode:
+    def one(agent: Agent, draws: Key[Array, " D"], weights: Any) -> Episode:
+        policy = algorithm.policy(agent.hyper, weights)
+        return rollouts(policy, agent.scenario.params, agent.scenario.layout, draws)
+
+    return jax.vmap(one)(agents, keys, weights)
+
+
+@partial(jax.jit, static_argnames="names")
+def _play_baselines(names: tuple[str, ...], agents: Agent, keys: Key[Array, "A D"]) -> dict[str, Episode]:
+    def one(agent: Agent, draws: Key[Array, " D"]) -> dict[str, Episode]:
+        world = (agent.scenario.params, agent.scenario.layout, draws)
+        return {name: rollouts(HEURISTICS[name], *world) for name in names}
+
+    return jax.vmap(one)(agents, keys)
