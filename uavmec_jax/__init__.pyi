@@ -3,11 +3,11 @@ from .learning.algorithm import Algorithm as Algorithm
 from .learning.dqn import DQNHyper as DQNHyper
 from .learning.dqn import DQNSpec as DQNSpec
 from .planning.heuristics import HEURISTICS as HEURISTICS
+from .studies.errors import StudyError as StudyError
 from .studies.results import Results as Results
 from .studies.results import load_results as load_results
 from .studies.run import run_study as run_study
 from .studies.schema import Study as Study
-from .studies.schema import StudyError as StudyError
 from .studies.study import load_study as load_study
 from .world.environment import Scenario as Scenario
 from .world.environment import UavMecEnv as UavMecEnv

@@ -9,10 +9,25 @@ from typing import Any, NoReturn
 
 import click
 
+from uavmec_jax.studies.errors import StudyError
+
 QUICK_STEPS, QUICK_SEEDS, QUICK_VALIDATE_EVERY = 50_000, 3, 5_000
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+class OneLine(click.Group):
+    """A group whose commands tell a user's mistake, or a full or closed disk, in one line: exit code 2."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command."""
+        try:
+            return super().invoke(ctx)
+        except StudyError as error:
+            _fail(error)
+        except OSError as error:
+            _fail(f"{error.filename}: {error.strerror}" if error.filename else error)
+
+
+@click.group(cls=OneLine, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="uavmec-jax")
 def main() -> None:
     """Which device should a rescue UAV serve next, and which will fail first?
@@ -68,22 +83,16 @@ def run(
     from uavmec_jax.reporting import figures
     from uavmec_jax.reporting.progress import progress_bar
     from uavmec_jax.studies.run import check_directory, plan_study, run_study
-    from uavmec_jax.studies.schema import StudyError
     from uavmec_jax.studies.study import load_study
 
     console = Console(stderr=as_json)
-    try:
-        resolved = load_study(study, overrides)
-        directory = out or Path("runs") / f"{resolved.name}-{time.strftime('%Y%m%d-%H%M%S')}"
-        check_directory(directory)
-        plan = plan_study(resolved)
-        console.print(f"[bold]{resolved.name}[/bold]: {plan}")
-        with progress_bar(console, plan) as on_progress:
-            results = run_study(resolved, directory, command=_command(), on_progress=on_progress)
-    except StudyError as error:
-        _fail(error)
-    except OSError as error:
-        _fail(f"{error.filename or out}: {error.strerror or error}")
+    resolved = load_study(study, overrides)
+    directory = out or Path("runs") / f"{resolved.name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    check_directory(directory)
+    plan = plan_study(resolved)
+    console.print(f"[bold]{resolved.name}[/bold]: {plan}")
+    with progress_bar(console, plan) as on_progress:
+        results = run_study(resolved, directory, command=_command(), on_progress=on_progress)
     if len(results.agents):
         figures.save(figures.run_figure(results), directory / "figure.png")
         _print(results, directory, console, as_json)
@@ -102,12 +111,8 @@ def show(directory: Path, as_json: bool) -> None:
     from rich.console import Console
 
     from uavmec_jax.studies.results import load_results
-    from uavmec_jax.studies.schema import StudyError
 
-    try:
-        results = load_results(directory)
-    except StudyError as error:
-        _fail(error)
+    results = load_results(directory)
     _print(results, directory, Console(stderr=as_json), as_json)
 
 
@@ -116,13 +121,9 @@ def show(directory: Path, as_json: bool) -> None:
 @click.option("--json", "as_json", is_flag=True, help="Print the resolved study as JSON.")
 def validate(file: str, as_json: bool) -> None:
     """Check the study FILE (or a shipped study) without running it."""
-    from uavmec_jax.studies.schema import StudyError
     from uavmec_jax.studies.study import load_study, n_agents
 
-    try:
-        study = load_study(file)
-    except StudyError as error:
-        _fail(error)
+    study = load_study(file)
     if as_json:
         click.echo(study.model_dump_json(indent=1))
     else:

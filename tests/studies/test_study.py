@@ -6,7 +6,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from uavmec_jax.studies import study as studies
-from uavmec_jax.studies.schema import StudyError
+from uavmec_jax.studies.errors import StudyError
 from uavmec_jax.studies.study import (
     evaluation_keys,
     identities,

@@ -17,10 +17,6 @@ from uavmec_jax.world.params import Params
 from uavmec_jax.world.rewards import DEFAULT_REWARD, LOG_GUARDS, REWARDS, TERMS
 
 
-class StudyError(ValueError):
-    """A study, a run folder or an option is not usable; the message is one line for the user."""
-
-
 class Strict(BaseModel):
     """No unknown keys, no coercion between types, no NaN or infinity unless a field allows it."""
 

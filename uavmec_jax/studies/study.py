@@ -17,7 +17,8 @@ import tomli_w
 
 from uavmec_jax.learning import dqn
 from uavmec_jax.learning.algorithm import Agent, Algorithm
-from uavmec_jax.studies.schema import TRACED, Study, StudyError, nearest, one_line
+from uavmec_jax.studies.errors import StudyError
+from uavmec_jax.studies.schema import TRACED, Study, nearest, one_line
 from uavmec_jax.world.environment import Scenario
 from uavmec_jax.world.layout import Layout, sample_layout
 from uavmec_jax.world.params import Params
