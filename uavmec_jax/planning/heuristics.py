@@ -10,9 +10,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PRNGKeyArray
 
+from uavmec_jax.planning import demand
+from uavmec_jax.planning.deadlines import earliest_deadline
+from uavmec_jax.planning.tour import shortest_tour
 from uavmec_jax.world.layout import Layout
 from uavmec_jax.world.params import Params
-from uavmec_jax.world.physics import State
+from uavmec_jax.world.physics import State, slots_to_expiry
 from uavmec_jax.world.rollout import Policy
 
 
@@ -42,7 +45,33 @@ def oldest_first(params: Params, layout: Layout, state: State, key: PRNGKeyArray
     return jnp.argmax(state.age).astype(jnp.int32)
 
 
+def lowest_battery(params: Params, layout: Layout, state: State, key: PRNGKeyArray | None = None) -> Array:
+    """Visit the device with the lowest battery fraction; ties go to the lowest number."""
+    return jnp.argmin(state.battery / layout.capacity).astype(jnp.int32)
+
+
+def shortest_life(params: Params, layout: Layout, state: State, key: PRNGKeyArray | None = None) -> Array:
+    """Visit the device that would fail first if nobody were served from now on, with the consumption to expect.
+
+    A battery lasts ``battery / (standby + expected work)`` slots, data last until they expire.
+    """
+    mean = demand.mean_slot(params, layout)
+    drain = layout.standby_power * jnp.min(mean.duration) + mean.work
+    battery = jnp.where(layout.has_power, jnp.inf, state.battery / jnp.maximum(drain, 1e-6))
+    data = jnp.where(layout.has_comms, jnp.inf, slots_to_expiry(params) - state.age)
+    return jnp.argmin(jnp.minimum(battery, data)).astype(jnp.int32)
+
+
 HEURISTICS: Mapping[str, Policy] = MappingProxyType(
-    {"stay-put": stay_put, "random": random, "round-robin": round_robin, "oldest-first": oldest_first}
+    {
+        "stay-put": stay_put,
+        "random": random,
+        "round-robin": round_robin,
+        "oldest-first": oldest_first,
+        "lowest-battery": lowest_battery,
+        "shortest-life": shortest_life,
+        "shortest-tour": shortest_tour,
+        "earliest-deadline": earliest_deadline,
+    }
 )
-"""The baselines by name."""
+"""The heuristics by name. None of them knows the volumes of the slot that it decides about."""

@@ -77,6 +77,11 @@ def initial_state(params: Params, layout: Layout) -> State:
     )
 
 
+def slots_to_expiry(params: Params) -> Any:
+    """Slots without service after which fresh data have expired: 11 with the paper's limit of 10."""
+    return jnp.where(params.age_at_limit_fails, params.data_age_limit_slots, params.data_age_limit_slots + 1)
+
+
 def upload_rate(params: Params, slant_distance_m: Float[Array, " n"]) -> Float[Array, " n"]:
     """Shannon rate of an upload to the UAV, bit/s (paper, equation 4); every served device has the full band."""
     gain = params.reference_gain * jnp.exp(-params.path_loss_exponent * jnp.log(slant_distance_m))
@@ -155,8 +160,7 @@ def _outcome(
     empty: Bool[Array, " n"],
 ) -> Outcome:
     """Check the failures after the slot: an empty battery outranks expired data."""
-    too_old = jnp.where(params.age_at_limit_fails, params.data_age_limit_slots, params.data_age_limit_slots + 1)
-    expired = starts & (after.age >= too_old)
+    expired = starts & (after.age >= slots_to_expiry(params))
     cause = jnp.where(
         starts,
         jnp.where(jnp.any(empty), Cause.BATTERY, jnp.where(jnp.any(expired), Cause.DATA_AGE, Cause.NONE)),

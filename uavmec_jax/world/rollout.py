@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Key, PRNGKeyArray
+from jaxtyping import Array, Int, Key, PRNGKeyArray
 
 from uavmec_jax.world.environment import draw_volumes
 from uavmec_jax.world.layout import Layout
@@ -42,6 +42,11 @@ def slot_volumes(params: Params, n_devices: int, key: PRNGKeyArray, slot: Any) -
     return draw_volumes(params, jax.random.uniform(jax.random.fold_in(key, slot), (n_devices,)))
 
 
+def volume_table(params: Params, n_devices: int, key: PRNGKeyArray, slots: int) -> Array:
+    """Volumes ``[slots, n]`` in bytes of the first slots of a volume draw, as the rollout of ``key`` meets them."""
+    return jax.vmap(lambda slot: slot_volumes(params, n_devices, key, slot))(jnp.arange(slots))
+
+
 def rollout(policy: Policy, params: Params, layout: Layout, key: PRNGKeyArray) -> Episode:
     """Play one episode.
 
@@ -52,6 +57,11 @@ def rollout(policy: Policy, params: Params, layout: Layout, key: PRNGKeyArray) -
         key: the volume draw. Two policies given the same key meet the same volumes, slot by slot. The policy's own
             randomness comes from another stream of the key.
     """
+    return play_on(policy, params, layout, initial_state(params, layout), key)
+
+
+def play_on(policy: Policy, params: Params, layout: Layout, state: State, key: PRNGKeyArray) -> Episode:
+    """Play an episode to its end from any state that has not failed; otherwise as :func:`rollout`."""
     n = layout.capacity.shape[0]
     policy_key = jax.random.fold_in(key, _POLICY_STREAM)
 
@@ -64,17 +74,60 @@ def rollout(policy: Policy, params: Params, layout: Layout, key: PRNGKeyArray) -
         action = policy(params, layout, state, jax.random.fold_in(policy_key, state.slot))
         return transition(params, layout, state, action, slot_volumes(params, n, key, state.slot))
 
-    nothing = Outcome(
+    state, outcome = jax.lax.while_loop(alive, play_slot, (state, _nothing(n)))
+    return Episode(length=state.slot, cause=outcome.cause, failed=outcome.failed, first_failure=outcome.first_failure)
+
+
+def _nothing(n: int) -> Outcome:
+    """The outcome before the first slot."""
+    return Outcome(
         cause=jnp.int32(Cause.NONE),
         failed=jnp.zeros(n, bool),
         served=jnp.zeros(n, bool),
         duration=jnp.float32(0),
         first_failure=jnp.zeros(n, jnp.float32),
     )
-    state, outcome = jax.lax.while_loop(alive, play_slot, (initial_state(params, layout), nothing))
-    return Episode(length=state.slot, cause=outcome.cause, failed=outcome.failed, first_failure=outcome.first_failure)
 
 
 def rollouts(policy: Policy, params: Params, layout: Layout, keys: Key[Array, " D"]) -> Episode:
     """Play one episode per volume draw; ``keys`` is ``[D]`` and every field of the result gains a leading ``D``."""
     return jax.vmap(lambda key: rollout(policy, params, layout, key))(keys)
+
+
+@struct.dataclass
+class Trace:
+    """An episode slot by slot; ``H`` slots, those after the end repeat the last state and have ``played`` False.
+
+    Attributes:
+        played: ``[H]`` bool.
+        action: ``[H]`` int32, device visited.
+        state: leaves ``[H, ...]``, the state after each slot.
+        outcome: leaves ``[H, ...]``, what each slot did.
+    """
+
+    played: Any
+    action: Any
+    state: State
+    outcome: Outcome
+
+
+def trace(policy: Policy, params: Params, layout: Layout, key: PRNGKeyArray, slots: int) -> Trace:
+    """The first ``slots`` slots of the episode that :func:`rollout` plays with the same key."""
+    n = layout.capacity.shape[0]
+    policy_key = jax.random.fold_in(key, _POLICY_STREAM)
+
+    def play_slot(carry: tuple[State, Outcome], slot: Array) -> tuple[tuple[State, Outcome], Trace]:
+        state, last = carry
+        played = (last.cause == Cause.NONE) & (slot < params.max_slots)
+        action = policy(params, layout, state, jax.random.fold_in(policy_key, state.slot))
+        new = transition(params, layout, state, action, slot_volumes(params, n, key, slot))
+        state, outcome = jax.tree.map(lambda new, old: jnp.where(played, new, old), new, carry)
+        return (state, outcome), Trace(played=played, action=action, state=state, outcome=outcome)
+
+    start = (initial_state(params, layout), _nothing(n))
+    return jax.lax.scan(play_slot, start, jnp.arange(slots))[1]
+
+
+def tour_policy(actions: Int[Array, " H"]) -> Policy:
+    """The policy that makes a tour: ``actions[slot]``."""
+    return lambda params, layout, state, key=None: actions[state.slot]

@@ -1,0 +1,177 @@
+"""A certificate: the lifetime that no policy passes on one layout with one volume draw.
+
+A life of k slots asks for k - 1 slots that every device survives and for k slots that the UAV pays for. Both are written
+as a linear program over ``x[t, a]``, the share of slot t that the UAV spends above device a, with everything relaxed that
+is not linear: ``rows @ x <= limits`` and ``sum_a x[t, a] = 1``. HiGHS (Huangfu and Hall 2018, through SciPy) looks for the
+``x`` that violates the rows least. Its multipliers ``y >= 0`` are the certificate: if ``sum_t min_a (y @ rows)[t, a]``
+exceeds ``y @ limits``, then no ``x`` at all satisfies the rows, and no policy lives k slots. That inequality is checked
+here, so the bound does not hang on the solver's tolerances. (Whole visits, the mixed-integer program, were measured to
+gain nothing over the whole-visit rows below.)
+
+What is relaxed: flight time does not lengthen a slot; uploads are those from right above a device; the UAV's flights
+cost at least what :mod:`uavmec_jax.planning.flight` says the rounds through the devices without communication take.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import numpy as np
+import scipy.sparse as sparse
+from scipy.optimize import linprog
+
+from uavmec_jax.planning import demand
+from uavmec_jax.planning.beam import counting_bound
+from uavmec_jax.planning.flight import Rounds
+from uavmec_jax.world.layout import Layout
+from uavmec_jax.world.params import Params
+from uavmec_jax.world.physics import slots_to_expiry
+
+_SLACK = 1e-5
+"""Relative allowance for the single precision of the slot's physics; in favour of the network."""
+
+_ROUNDING = 1e-10
+"""Relative allowance for the double precision of the check."""
+
+_SOLVED = 0
+"""Status of SciPy's ``linprog``."""
+
+
+@dataclass(frozen=True)
+class _Facts:
+    """One layout with one volume draw as NumPy arrays in double precision; see :class:`demand.SlotCosts`."""
+
+    covers: np.ndarray
+    duration: np.ndarray
+    work: np.ndarray
+    upload: np.ndarray
+    counting: int
+    base_power: float
+    extra_power: float
+    to_expiry: int
+
+
+@jax.jit
+def _facts(params: Params, layout: Layout, volumes: np.ndarray) -> dict:
+    costs = demand.slot_costs(params, layout, volumes)
+    base, extra = demand.flight_power(params)
+    return {
+        "covers": demand.coverage(params, layout),
+        "duration": costs.duration,
+        "work": costs.work,
+        "upload": costs.upload,
+        "counting": counting_bound(params, layout, costs),
+        "base_power": base,
+        "extra_power": extra,
+        "to_expiry": slots_to_expiry(params),
+    }
+
+
+def upper_bound(params: Params, layout: Layout, volumes: np.ndarray, at_least: int = 1) -> int:
+    """The longest lifetime, in slots, that is not refuted; every policy's lifetime is at most this.
+
+    Args:
+        params: scenario parameters, plain numbers.
+        layout: the devices.
+        volumes: ``[H, n]`` bytes, ``H`` from :func:`uavmec_jax.planning.beam.horizon`.
+        at_least: a lifetime that some policy reached; the search starts there and is short if that is the optimum.
+    """
+    found = {name: np.asarray(value, float) for name, value in _facts(params, layout, volumes).items()}
+    facts = _Facts(
+        **{name: found[name] for name in ("covers", "duration", "work", "upload")},
+        counting=int(found["counting"]),
+        base_power=float(found["base_power"]),
+        extra_power=float(found["extra_power"]),
+        to_expiry=int(found["to_expiry"]),
+    )
+    layout = jax.tree.map(np.asarray, layout)
+    rounds = Rounds(np.asarray(layout.position, float), facts.covers > 0, ~layout.has_comms, facts.to_expiry)
+    possible = partial(_possible, params, layout, facts, rounds)
+    # What is possible for a lifetime is possible for every shorter one, so one step that fails is enough.
+    low, high = at_least, facts.counting
+    if low < high and not possible(low + 1):
+        return low
+    low = min(low + 1, high)
+    while low < high:
+        middle = (low + high + 1) // 2
+        low, high = (middle, high) if possible(middle) else (low, middle - 1)
+    return low
+
+
+def _possible(params: Params, layout: Layout, facts: _Facts, rounds: Rounds, life: int) -> bool:
+    """Whether the relaxation leaves a lifetime of ``life`` slots open."""
+    survive, paid = life - 1, life - int(bool(params.count_unfinished_slot))
+    n, slots = len(facts.work[0]), max(survive, paid, 1)
+    rows, limits = _battery_rows(layout, facts, survive, slots)
+    if rows is None:
+        return False
+    fresh = _age_rows(layout, facts, survive, slots)
+    energy = np.zeros((1, slots, n))
+    energy[0, :paid] = facts.base_power * facts.duration[:paid]
+    flights = facts.extra_power * rounds.least_flight(survive) / float(params.uav_speed_m_s)
+    budget = float(params.uav_battery_j) * (1.0 + _SLACK) - flights * (1.0 - _SLACK)
+    rows = np.concatenate([rows, fresh, energy / budget]) if budget > 0 else energy[:0]
+    limits = np.concatenate([limits, np.full(len(fresh), -1.0), [1.0]])
+    return budget > 0 and not _refuted(rows, limits)
+
+
+def _refuted(rows: np.ndarray, limits: np.ndarray) -> bool:
+    """Whether no ``x [T, n]`` with ``x >= 0`` and ``x[t].sum() = 1`` has ``rows [R, T, n] @ x <= limits [R]``."""
+    count, slots, n = rows.shape
+    flat = rows.reshape(count, slots * n)
+    answer = linprog(
+        np.append(np.zeros(slots * n), 1.0),
+        A_ub=sparse.hstack([sparse.csr_array(flat), np.full((count, 1), -1.0)], format="csr"),
+        b_ub=limits,
+        A_eq=sparse.hstack(
+            [sparse.kron(sparse.eye_array(slots), np.ones((1, n))), sparse.csr_array((slots, 1))], format="csr"
+        ),
+        b_eq=np.ones(slots),
+        bounds=[(0.0, None)] * (slots * n) + [(None, None)],
+        method="highs-ds",
+    )
+    if answer.status != _SOLVED:
+        return False
+    multipliers = np.maximum(-answer.ineqlin.marginals, 0.0)
+    least = np.sum(np.min((multipliers @ flat).reshape(slots, n), axis=1))
+    return bool(least > multipliers @ limits + _ROUNDING * np.abs(multipliers) @ np.abs(limits))
+
+
+def _battery_rows(layout: Layout, facts: _Facts, survive: int, slots: int) -> tuple[np.ndarray | None, np.ndarray]:
+    """``rows @ x <= limits`` for the batteries: energy, and whole visits with the largest savings skipped first.
+
+    ``None`` if a battery is empty even with a service in every slot.
+    """
+    n = len(layout.capacity)
+    rows, limits = [], []
+    shortest = facts.duration[:survive].min(axis=1, initial=np.inf)
+    for device in np.flatnonzero(~layout.has_power):
+        served = facts.covers[:, device] > 0
+        capacity, standby = float(layout.capacity[device]) * (1.0 + _SLACK), float(layout.standby_power[device])
+        work, upload = facts.work[:survive, device], facts.upload[:survive, device]
+        row = np.zeros((slots, n))
+        row[:survive] = standby * facts.duration[:survive] + np.where(served, upload[:, None], work[:, None])
+        rows.append(row / capacity)
+        limits.append(1.0)
+        saved = np.cumsum(np.sort(np.maximum(work - upload, 0.0))[::-1])
+        missing = float(np.sum(standby * shortest + work)) - capacity
+        visits = 0 if missing < 0 else 1 + int(np.sum(saved <= missing))
+        if visits > survive:
+            return None, np.zeros(0)
+        if visits:
+            row = np.zeros((slots, n))
+            row[:survive] = -served.astype(float)
+            rows.append(row)
+            limits.append(-float(visits))
+    return np.array(rows).reshape(-1, slots, n), np.array(limits)
+
+
+def _age_rows(layout: Layout, facts: _Facts, survive: int, slots: int) -> np.ndarray:
+    """``rows @ x <= -1``: a device without communication is served in every run of slots that expires its data."""
+    rows = []
+    for device in np.flatnonzero(~layout.has_comms):
+        for start in range(survive - facts.to_expiry + 1):
+            row = np.zeros((slots, len(layout.capacity)))
+            row[start : start + facts.to_expiry] = -facts.covers[:, device]
+            rows.append(row)
+    return np.array(rows).reshape(-1, slots, len(layout.capacity))
