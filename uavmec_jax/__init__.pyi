@@ -1,9 +1,10 @@
+from .errors import LayoutError as LayoutError
+from .errors import StudyError as StudyError
 from .learning.algorithm import Agent as Agent
 from .learning.algorithm import Algorithm as Algorithm
 from .learning.dqn import DQNHyper as DQNHyper
 from .learning.dqn import DQNSpec as DQNSpec
 from .planning.heuristics import HEURISTICS as HEURISTICS
-from .studies.errors import StudyError as StudyError
 from .studies.results import Results as Results
 from .studies.results import load_results as load_results
 from .studies.run import run_study as run_study

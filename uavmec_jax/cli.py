@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 
 import click
 
-from uavmec_jax.studies.errors import StudyError
+from uavmec_jax.errors import UserError
 
 QUICK_STEPS, QUICK_SEEDS, QUICK_VALIDATE_EVERY = 50_000, 3, 5_000
 
@@ -21,7 +21,7 @@ class OneLine(click.Group):
         """Run the command."""
         try:
             return super().invoke(ctx)
-        except StudyError as error:
+        except UserError as error:
             _fail(error)
         except OSError as error:
             _fail(f"{error.filename}: {error.strerror}" if error.filename else error)

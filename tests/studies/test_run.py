@@ -7,9 +7,9 @@ import pandas as pd
 import pytest
 from numpy.testing import assert_array_equal
 
+from uavmec_jax.errors import StudyError
 from uavmec_jax.reporting import figures, tables
 from uavmec_jax.studies import host
-from uavmec_jax.studies.errors import StudyError
 from uavmec_jax.studies.results import load_results, load_weights
 from uavmec_jax.studies.run import _BYTES_WITHOUT_TRAINING, check_directory, plan_study, run_study
 from uavmec_jax.studies.study import parse_study

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from uavmec_jax.errors import StudyError
 from uavmec_jax.studies import study as studies
-from uavmec_jax.studies.errors import StudyError
 from uavmec_jax.studies.study import (
     evaluation_keys,
     identities,

@@ -17,7 +17,7 @@ from functools import partial
 
 import jax
 import numpy as np
-import scipy.sparse as sparse
+from jaxtyping import Array, Num
 from scipy.optimize import linprog
 
 from uavmec_jax.planning import demand
@@ -52,7 +52,7 @@ class _Facts:
 
 
 @jax.jit
-def _facts(params: Params, layout: Layout, volumes: np.ndarray) -> dict:
+def _facts(params: Params, layout: Layout, volumes: Num[Array, "H n"]) -> dict:
     costs = demand.slot_costs(params, layout, volumes)
     base, extra = demand.flight_power(params)
     return {
@@ -67,7 +67,7 @@ def _facts(params: Params, layout: Layout, volumes: np.ndarray) -> dict:
     }
 
 
-def upper_bound(params: Params, layout: Layout, volumes: np.ndarray, at_least: int = 1) -> int:
+def upper_bound(params: Params, layout: Layout, volumes: Num[Array, "H n"], at_least: int = 1) -> int:
     """The longest lifetime, in slots, that is not refuted; every policy's lifetime is at most this.
 
     Args:
@@ -121,13 +121,11 @@ def _refuted(rows: np.ndarray, limits: np.ndarray) -> bool:
     flat = rows.reshape(count, slots * n)
     answer = linprog(
         np.append(np.zeros(slots * n), 1.0),
-        A_ub=sparse.hstack([sparse.csr_array(flat), np.full((count, 1), -1.0)], format="csr"),
+        A_ub=np.column_stack([flat, np.full(count, -1.0)]),
         b_ub=limits,
-        A_eq=sparse.hstack(
-            [sparse.kron(sparse.eye_array(slots), np.ones((1, n))), sparse.csr_array((slots, 1))], format="csr"
-        ),
+        A_eq=np.column_stack([np.kron(np.eye(slots), np.ones(n)), np.zeros(slots)]),
         b_eq=np.ones(slots),
-        bounds=[(0.0, None)] * (slots * n) + [(None, None)],
+        bounds=[*[(0.0, None)] * (slots * n), (None, None)],
         method="highs-ds",
     )
     if answer.status != _SOLVED:

@@ -18,7 +18,7 @@ from uavmec_jax.world.layout import Layout
 from uavmec_jax.world.params import Params
 from uavmec_jax.world.physics import State, slots_to_expiry
 
-LOOKAHEAD = 40
+LOOKAHEAD = 64
 """Slots that the rule looks ahead at most; at the paper's settings the UAV's battery lasts 33."""
 
 _NEVER = 1e6
@@ -33,51 +33,52 @@ def earliest_deadline(params: Params, layout: Layout, state: State, key: PRNGKey
     into which all visits that are then needed still fit. Where nothing is asked for and the ages can spare the slot,
     the UAV stays where it is.
     """
-    covers = demand.coverage(params, layout)
-    charged = demand.shares(layout, covers)
+    charged = demand.shares(layout, demand.coverage(params, layout))
     mean = demand.mean_slot(params, layout)
-    slots, visits = _hoped_for(params, layout, state, mean, charged)
+    slots, services = _hoped_for(params, layout, state, mean, charged)
 
     away = jnp.linalg.norm(layout.position - state.uav_position, axis=-1)
     due = (slots_to_expiry(params) - state.age).astype(jnp.float32)
     due = jnp.where(layout.has_comms | (due > slots), _NEVER, due)
-    spare = _may_spend(covers, charged, due)
+    freshness = jnp.argmin(due + _TIE_PER_M * away)
 
     drain = layout.standby_power * jnp.min(mean.duration) + mean.work
-    empties = jnp.where(visits > 0, state.battery / jnp.maximum(drain, 1e-6), _NEVER)
-    battery = jnp.argmin(jnp.where(spare & (visits > 0), empties + _TIE_PER_M * away, jnp.inf))
-    freshness = jnp.argmin(due + _TIE_PER_M * away)
-    here = spare & (away <= 0.0)
-    rest = jnp.where(jnp.any(here), jnp.argmax(here), freshness)
-    return jnp.where(jnp.any(spare & (visits > 0)), battery, rest).astype(jnp.int32)
+    empties = jnp.where(services > 0, state.battery / jnp.maximum(drain, 1e-6), jnp.inf)
+    battery = jnp.argmin(empties + _TIE_PER_M * away)
+    here = jnp.where(jnp.min(away) <= 0.0, jnp.argmin(away), freshness)
+    spare = jnp.where(jnp.any(services > 0), battery, here)
+    return jnp.where(_can_wait(charged, due), spare, freshness).astype(jnp.int32)
 
 
 def _hoped_for(
     params: Params, layout: Layout, state: State, mean: SlotCosts, charged: Float[Array, " n"]
 ) -> tuple[Any, Float[Array, " n"]]:
     """Slots that may still be survived, and the services that each battery then needs."""
-    slots = jnp.arange(1.0, LOOKAHEAD + 1.0)
     shortest = jnp.min(mean.duration)
     drain = layout.standby_power * shortest + mean.work
-    saving = jnp.maximum(mean.work - mean.upload, 1e-6)
-    missing = slots[:, None] * drain - state.battery
-    visits = jnp.where(layout.has_power | (missing < 0.0), 0.0, jnp.floor(missing / saving) + 1.0)
-    fresh, _ = demand.age_visits(params, layout, state.age, slots[:, None])
-    need = jnp.maximum(visits, fresh)
+    per_saving = jnp.where(layout.has_power, 0.0, 1.0 / jnp.maximum(mean.work - mean.upload, 1e-3))
     base, _ = demand.flight_power(params)
-    fits = (
-        (need @ charged <= slots)
-        & jnp.all(need <= slots[:, None], axis=1)
-        & (slots * base * shortest <= state.uav_energy)
-    )
-    longest = jnp.max(jnp.where(fits, jnp.arange(LOOKAHEAD), 0))
-    return slots[longest], visits[longest]
+
+    def services(slots: Array) -> Array:
+        missing = slots * drain - state.battery
+        return jnp.where(missing < 0.0, 0.0, jnp.floor(missing * per_saving) + 1.0) * ~layout.has_power
+
+    def fits(slots: Array) -> Array:
+        fresh, _ = demand.age_visits(params, layout, state.age, slots)
+        need = jnp.maximum(services(slots), fresh)
+        return (need @ charged <= slots) & jnp.all(need <= slots) & (slots * base * shortest <= state.uav_energy)
+
+    # Bisection: what fits into a number of slots fits into fewer.
+    slots = jnp.float32(0.0)
+    step = LOOKAHEAD // 2
+    while step:
+        slots = jnp.where(fits(slots + step), slots + step, slots)
+        step //= 2
+    slots = jnp.maximum(slots, 1.0)
+    return slots, services(slots)
 
 
-def _may_spend(
-    covers: Bool[Array, "n n"], charged: Float[Array, " n"], due: Float[Array, " n"]
-) -> Bool[Array, " n"]:
-    """Above which devices a slot may be spent: the data of those not served there can still be fetched in time."""
-    others = jnp.where(covers, _NEVER, due)
-    load = jnp.sum(jnp.where(others[:, None, :] <= others[:, :, None], charged, 0.0), axis=-1)
-    return jnp.all((others == _NEVER) | (load + 1.0 <= others + 1e-4), axis=-1)
+def _can_wait(charged: Float[Array, " n"], due: Float[Array, " n"]) -> Bool[Array, ""]:
+    """Whether a slot may be spent on something else: all data can then still be fetched before they expire."""
+    load = jnp.sum(jnp.where(due <= due[:, None], charged, 0.0), axis=-1)
+    return jnp.all((due == _NEVER) | (load + 1.0 <= due + 1e-4))

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from flax import traverse_util
 
-from uavmec_jax.studies.errors import StudyError
+from uavmec_jax.errors import StudyError
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.studies.statistics import mean_interval
 from uavmec_jax.studies.study import cell_axes, load_study, study_toml

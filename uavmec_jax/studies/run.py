@@ -11,12 +11,12 @@ from typing import Any
 import jax
 import pandas as pd
 
+from uavmec_jax.errors import StudyError
 from uavmec_jax.learning import population
 from uavmec_jax.learning.algorithm import Agent, Algorithm
 from uavmec_jax.learning.blocks import Blocks, PopulationTooLargeError, plan_blocks
 from uavmec_jax.learning.population import Progress, TrainedBlock, Validation
 from uavmec_jax.studies import host
-from uavmec_jax.studies.errors import StudyError
 from uavmec_jax.studies.evaluation import judge
 from uavmec_jax.studies.results import SCHEMA, Results, holds_run
 from uavmec_jax.studies.schema import Study

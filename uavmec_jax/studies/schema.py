@@ -5,53 +5,17 @@ The numbers of Table 1 and the hyperparameters are declared once, as pytrees (:c
 """
 
 import dataclasses
-import difflib
-import math
 from typing import Annotated, Any, Literal
 
 import pydantic
-from pydantic import BaseModel, ConfigDict, Field, create_model
+from pydantic import Field
 
 from uavmec_jax.learning.dqn import DQNHyper, DQNSpec
 from uavmec_jax.world.params import Params
 from uavmec_jax.world.rewards import DEFAULT_REWARD, LOG_GUARDS, REWARDS, TERMS
+from uavmec_jax.world.settings import ParamsSettings, Strict, nearest, settings_model, wanted
 
-
-class Strict(BaseModel):
-    """No unknown keys, no coercion between types, no NaN or infinity unless a field allows it."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
-
-
-def _field(field: dataclasses.Field) -> Any:
-    """Type and bounds of one setting, from its default and its metadata."""
-    default, bounds = field.default, {k: v for k, v in field.metadata.items() if k in ("gt", "ge", "lt", "le")}
-    if isinstance(default, bool):
-        return bool, default
-    if isinstance(default, int):
-        return Annotated[int, Field(**{"ge": 0, **bounds})], default
-    if isinstance(default, float):
-        infinite = math.isinf(default)
-        return Annotated[
-            float, Field(**{**({"ge": 0} if not bounds else {}), **bounds}, allow_inf_nan=infinite)
-        ], default
-    if field.name == "hidden":
-        return tuple[Annotated[int, Field(ge=1, le=4096)], ...], default
-    return tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]], default
-
-
-def _model(name: str, *declarations: type, leave_out: tuple[str, ...] = ()) -> Any:
-    fields = {
-        field.name: _field(field)
-        for declaration in declarations
-        for field in dataclasses.fields(declaration)
-        if field.name not in leave_out
-    }
-    return create_model(name, __base__=Strict, **fields)
-
-
-DQNSettings: Any = _model("DQNSettings", DQNHyper, DQNSpec, leave_out=("total_steps", "n_devices", "max_age"))
-ParamsSettings: Any = _model("ParamsSettings", Params)
+DQNSettings: Any = settings_model("DQNSettings", DQNHyper, DQNSpec, leave_out=("total_steps", "n_devices", "max_age"))
 
 TRACED = tuple(field.name for field in dataclasses.fields(DQNHyper))
 """Hyperparameters that may be axes of a study."""
@@ -157,32 +121,4 @@ def _check_value(study: Study, name: str, where: str, value: Any) -> None:
         try:
             settings(**{name: value})
         except pydantic.ValidationError as error:
-            raise ValueError(f"{where} has {value!r}; {_wanted(error.errors()[0])}") from None
-
-
-def nearest(word: str, words: Any) -> str:
-    """A hint: the nearest of the known words, or all of them."""
-    close = difflib.get_close_matches(word, list(words), n=1, cutoff=0.4)
-    return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(words)}"
-
-
-def _wanted(error: Any) -> str:
-    message: str = error["msg"]
-    return message.replace("Input should be", "it should be").replace("Value error, ", "")
-
-
-def one_line(source: str, error: pydantic.ValidationError) -> str:
-    """The first problem as one line: file, field, value, and what would be right."""
-    first = error.errors()[0]
-    place = ".".join(str(part) for part in first["loc"] if part not in ("int", "str", "float", "bool"))
-    if first["type"] == "value_error":
-        return f"{source}: {_wanted(first)}"
-    if first["type"] == "extra_forbidden":
-        parent: Any = Study
-        for part in first["loc"][:-1]:
-            parent = parent.model_fields[part].annotation if part in getattr(parent, "model_fields", {}) else None
-        known = getattr(parent, "model_fields", {})
-        return f"{source}: {place} is not a setting; {nearest(str(first['loc'][-1]), known)}"
-    if first["type"] == "missing":
-        return f"{source}: {place} is missing"
-    return f"{source}: {place} is {first['input']!r}; {_wanted(first)}"
+            raise ValueError(f"{where} has {value!r}; {wanted(error.errors()[0])}") from None

@@ -15,14 +15,15 @@ import numpy as np
 import pydantic
 import tomli_w
 
+from uavmec_jax.errors import StudyError
 from uavmec_jax.learning import dqn
 from uavmec_jax.learning.algorithm import Agent, Algorithm
-from uavmec_jax.studies.errors import StudyError
-from uavmec_jax.studies.schema import TRACED, Study, nearest, one_line
+from uavmec_jax.studies.schema import TRACED, Study
 from uavmec_jax.world.environment import Scenario
 from uavmec_jax.world.layout import Layout, sample_layout
 from uavmec_jax.world.params import Params
 from uavmec_jax.world.rewards import make_reward
+from uavmec_jax.world.settings import nearest, one_line
 
 # Streams of randomness: the seed of the root key. An agent's share of each hangs on its identity.
 _LAYOUT, _TRAINING, _VALIDATION, _HELD_OUT, _FIXED = range(5)
@@ -83,7 +84,7 @@ def parse_study(text: str, source: str, overrides: Mapping[str, Any] | None = No
     try:
         return Study.model_validate(_listed(data))
     except pydantic.ValidationError as error:
-        raise StudyError(one_line(source, error)) from None
+        raise StudyError(one_line(source, error, Study)) from None
 
 
 def _listed(data: dict[str, Any]) -> dict[str, Any]:

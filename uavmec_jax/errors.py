@@ -1,0 +1,13 @@
+"""What a user can mend, told in one line. Imports nothing, so that the command line can catch it without loading JAX."""
+
+
+class UserError(ValueError):
+    """Something given is not usable; the message is one line that names it and says what would be right."""
+
+
+class StudyError(UserError):
+    """A study, a run folder or an option is not usable."""
+
+
+class LayoutError(UserError):
+    """An inventory of devices is not usable."""
