@@ -64,13 +64,14 @@ def run(
     out: Path | None,
     as_json: bool,
 ) -> None:
-    """Train and judge STUDY: a study that ships with the package (table5, table5-tuned) or a TOML file."""
+    """Train and judge STUDY: a study that ships with the package (table5, table5-tuned, planning) or a TOML file."""
     overrides: dict[str, Any] = {}
     if quick:
         overrides |= {
             "axes.seeds": QUICK_SEEDS,
             "steps": QUICK_STEPS,
             "evaluation.validate_every": QUICK_VALIDATE_EVERY,
+            "evaluation.planner_draws": 1,
         }
     overrides |= {name: value for name, value in (("axes.seeds", seeds), ("steps", steps)) if value is not None}
     overrides |= dict(_setting(setting) for setting in settings)

@@ -184,8 +184,8 @@ def _advance(problem: _Problem, aim: Int[Array, ""], width: int, beam: _Beam) ->
     survives = (beam.alive[:, None] & (outcome.cause == Cause.NONE) & (after.slot < params.max_slots)).reshape(-1)
     after = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), after)
     promise = jnp.where(survives, _promise(problem, beam.slot + 1, aim, after), -jnp.inf)
-    # Twice the width is held against each other, so that what falls out leaves no gap.
-    promise, chosen = jax.lax.top_k(promise, min(2 * width, n * width))
+    # Half as many again are held against each other, so that what falls out leaves no gap.
+    promise, chosen = jax.lax.top_k(promise, min(width + width // 2, n * width))
     kept = jax.tree.map(lambda leaf: leaf[chosen], after)
     promise = jnp.where(_dominated(layout, kept, chosen % n, promise > -jnp.inf), -jnp.inf, promise)
     promise, best = jax.lax.top_k(promise, width)

@@ -13,11 +13,12 @@ cost at least what :mod:`uavmec_jax.planning.flight` says the rounds through the
 """
 
 from dataclasses import dataclass
-from functools import partial
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Num
+from jaxtyping import Array, Int, Num
 from scipy.optimize import linprog
 
 from uavmec_jax.planning import demand
@@ -39,23 +40,33 @@ _SOLVED = 0
 
 @dataclass(frozen=True)
 class _Facts:
-    """One layout with one volume draw as NumPy arrays in double precision; see :class:`demand.SlotCosts`."""
+    """A scenario with a volume draw, NumPy in double precision; see :class:`demand.SlotCosts` and :class:`Layout`."""
 
+    position: np.ndarray
+    capacity: np.ndarray
+    standby_power: np.ndarray
+    has_power: np.ndarray
+    has_comms: np.ndarray
     covers: np.ndarray
     duration: np.ndarray
     work: np.ndarray
     upload: np.ndarray
-    counting: int
-    base_power: float
-    extra_power: float
-    to_expiry: int
+    counting: np.ndarray
+    base_power: np.ndarray
+    extra_power: np.ndarray
+    to_expiry: np.ndarray
+    unfinished: np.ndarray
+    uav_battery: np.ndarray
+    uav_speed: np.ndarray
 
 
 @jax.jit
-def _facts(params: Params, layout: Layout, volumes: Num[Array, "H n"]) -> dict:
+@jax.vmap
+def _facts(params: Params, layout: Layout, volumes: Num[Array, "H n"]) -> dict[str, Any]:
     costs = demand.slot_costs(params, layout, volumes)
     base, extra = demand.flight_power(params)
-    return {
+    taken = ("position", "capacity", "standby_power", "has_power", "has_comms")
+    return {name: getattr(layout, name) for name in taken} | {
         "covers": demand.coverage(params, layout),
         "duration": costs.duration,
         "work": costs.work,
@@ -64,6 +75,9 @@ def _facts(params: Params, layout: Layout, volumes: Num[Array, "H n"]) -> dict:
         "base_power": base,
         "extra_power": extra,
         "to_expiry": slots_to_expiry(params),
+        "unfinished": jnp.where(params.count_unfinished_slot, 1, 0),
+        "uav_battery": params.uav_battery_j,
+        "uav_speed": params.uav_speed_m_s,
     }
 
 
@@ -71,48 +85,54 @@ def upper_bound(params: Params, layout: Layout, volumes: Num[Array, "H n"], at_l
     """The longest lifetime, in slots, that is not refuted; every policy's lifetime is at most this.
 
     Args:
-        params: scenario parameters, plain numbers.
+        params: scenario parameters.
         layout: the devices.
-        volumes: ``[H, n]`` bytes, ``H`` from :func:`uavmec_jax.planning.beam.horizon`.
+        volumes: bytes, ``H`` from :func:`uavmec_jax.planning.beam.horizon`.
         at_least: a lifetime that some policy reached; the search starts there and is short if that is the optimum.
     """
-    found = {name: np.asarray(value, float) for name, value in _facts(params, layout, volumes).items()}
-    facts = _Facts(
-        **{name: found[name] for name in ("covers", "duration", "work", "upload")},
-        counting=int(found["counting"]),
-        base_power=float(found["base_power"]),
-        extra_power=float(found["extra_power"]),
-        to_expiry=int(found["to_expiry"]),
-    )
-    layout = jax.tree.map(np.asarray, layout)
-    rounds = Rounds(np.asarray(layout.position, float), facts.covers > 0, ~layout.has_comms, facts.to_expiry)
-    possible = partial(_possible, params, layout, facts, rounds)
-    # What is possible for a lifetime is possible for every shorter one, so one step that fails is enough.
-    low, high = at_least, facts.counting
-    if low < high and not possible(low + 1):
+    params, layout, volumes = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], (params, layout, volumes))
+    return int(upper_bounds(params, layout, volumes, np.array([at_least]))[0])
+
+
+def upper_bounds(
+    params: Params, layouts: Layout, volumes: Num[Array, "B H n"], at_least: np.ndarray
+) -> Int[np.ndarray, " B"]:
+    """:func:`upper_bound` for ``B`` scenarios; every leaf has a leading ``B``."""
+    found = {name: np.asarray(leaf) for name, leaf in _facts(params, layouts, volumes).items()}
+    found = {name: leaf.astype(float) if leaf.dtype == np.float32 else leaf for name, leaf in found.items()}
+    facts = (_Facts(**{name: leaf[b] for name, leaf in found.items()}) for b in range(len(at_least)))
+    return np.array([_bound(own, int(reached)) for own, reached in zip(facts, at_least, strict=True)], np.int32)
+
+
+def _bound(facts: _Facts, low: int) -> int:
+    """The longest life from ``low`` on that is not refuted. A refuted life refutes every longer one."""
+    rounds = Rounds(facts.position, facts.covers, ~facts.has_comms, int(facts.to_expiry))
+    high = int(facts.counting)
+    if low < high and not _possible(facts, rounds, low + 1):
         return low
-    low = min(low + 1, high)
+    low = min(low + 1, high) if low < high else low
     while low < high:
         middle = (low + high + 1) // 2
-        low, high = (middle, high) if possible(middle) else (low, middle - 1)
+        low, high = (middle, high) if _possible(facts, rounds, middle) else (low, middle - 1)
     return low
 
 
-def _possible(params: Params, layout: Layout, facts: _Facts, rounds: Rounds, life: int) -> bool:
+def _possible(facts: _Facts, rounds: Rounds, life: int) -> bool:
     """Whether the relaxation leaves a lifetime of ``life`` slots open."""
-    survive, paid = life - 1, life - int(bool(params.count_unfinished_slot))
-    n, slots = len(facts.work[0]), max(survive, paid, 1)
-    rows, limits = _battery_rows(layout, facts, survive, slots)
+    survive, paid = life - 1, life - int(facts.unfinished)
+    slots = max(survive, paid, 1)
+    rows, limits = _battery_rows(facts, survive, slots)
     if rows is None:
         return False
-    fresh = _age_rows(layout, facts, survive, slots)
-    energy = np.zeros((1, slots, n))
+    fresh = _age_rows(facts, survive, slots)
+    energy = np.zeros((1, *rows.shape[1:]))
     energy[0, :paid] = facts.base_power * facts.duration[:paid]
-    flights = facts.extra_power * rounds.least_flight(survive) / float(params.uav_speed_m_s)
-    budget = float(params.uav_battery_j) * (1.0 + _SLACK) - flights * (1.0 - _SLACK)
-    rows = np.concatenate([rows, fresh, energy / budget]) if budget > 0 else energy[:0]
-    limits = np.concatenate([limits, np.full(len(fresh), -1.0), [1.0]])
-    return budget > 0 and not _refuted(rows, limits)
+    flights = facts.extra_power * rounds.least_flight(survive) / facts.uav_speed
+    budget = facts.uav_battery * (1.0 + _SLACK) - flights * (1.0 - _SLACK)
+    if budget <= 0.0:
+        return False
+    rows = np.concatenate([rows, fresh, energy / budget])
+    return not _refuted(rows, np.concatenate([limits, np.full(len(fresh), -1.0), [1.0]]))
 
 
 def _refuted(rows: np.ndarray, limits: np.ndarray) -> bool:
@@ -135,24 +155,24 @@ def _refuted(rows: np.ndarray, limits: np.ndarray) -> bool:
     return bool(least > multipliers @ limits + _ROUNDING * np.abs(multipliers) @ np.abs(limits))
 
 
-def _battery_rows(layout: Layout, facts: _Facts, survive: int, slots: int) -> tuple[np.ndarray | None, np.ndarray]:
+def _battery_rows(facts: _Facts, survive: int, slots: int) -> tuple[np.ndarray | None, np.ndarray]:
     """``rows @ x <= limits`` for the batteries: energy, and whole visits with the largest savings skipped first.
 
     ``None`` if a battery is empty even with a service in every slot.
     """
-    n = len(layout.capacity)
+    n = len(facts.capacity)
     rows, limits = [], []
     shortest = facts.duration[:survive].min(axis=1, initial=np.inf)
-    for device in np.flatnonzero(~layout.has_power):
-        served = facts.covers[:, device] > 0
-        capacity, standby = float(layout.capacity[device]) * (1.0 + _SLACK), float(layout.standby_power[device])
+    for device in np.flatnonzero(~facts.has_power):
+        served = facts.covers[:, device]
+        capacity, standby = facts.capacity[device] * (1.0 + _SLACK), facts.standby_power[device]
         work, upload = facts.work[:survive, device], facts.upload[:survive, device]
         row = np.zeros((slots, n))
         row[:survive] = standby * facts.duration[:survive] + np.where(served, upload[:, None], work[:, None])
         rows.append(row / capacity)
         limits.append(1.0)
         saved = np.cumsum(np.sort(np.maximum(work - upload, 0.0))[::-1])
-        missing = float(np.sum(standby * shortest + work)) - capacity
+        missing = np.sum(standby * shortest + work) - capacity
         visits = 0 if missing < 0 else 1 + int(np.sum(saved <= missing))
         if visits > survive:
             return None, np.zeros(0)
@@ -164,12 +184,12 @@ def _battery_rows(layout: Layout, facts: _Facts, survive: int, slots: int) -> tu
     return np.array(rows).reshape(-1, slots, n), np.array(limits)
 
 
-def _age_rows(layout: Layout, facts: _Facts, survive: int, slots: int) -> np.ndarray:
+def _age_rows(facts: _Facts, survive: int, slots: int) -> np.ndarray:
     """``rows @ x <= -1``: a device without communication is served in every run of slots that expires its data."""
     rows = []
-    for device in np.flatnonzero(~layout.has_comms):
-        for start in range(survive - facts.to_expiry + 1):
-            row = np.zeros((slots, len(layout.capacity)))
-            row[start : start + facts.to_expiry] = -facts.covers[:, device]
+    for device in np.flatnonzero(~facts.has_comms):
+        for start in range(survive - int(facts.to_expiry) + 1):
+            row = np.zeros((slots, len(facts.capacity)))
+            row[start : start + int(facts.to_expiry)] = -facts.covers[:, device].astype(float)
             rows.append(row)
-    return np.array(rows).reshape(-1, slots, len(layout.capacity))
+    return np.array(rows).reshape(-1, slots, len(facts.capacity))

@@ -33,13 +33,12 @@ def earliest_deadline(params: Params, layout: Layout, state: State, key: PRNGKey
     into which all visits that are then needed still fit. Where nothing is asked for and the ages can spare the slot,
     the UAV stays where it is.
     """
-    charged = demand.shares(layout, demand.coverage(params, layout))
+    covers = demand.coverage(params, layout)
     mean = demand.mean_slot(params, layout)
-    slots, services = _hoped_for(params, layout, state, mean, charged)
+    slots, services = _hoped_for(params, layout, state, mean, demand.shares(layout, covers))
 
     away = jnp.linalg.norm(layout.position - state.uav_position, axis=-1)
-    due = (slots_to_expiry(params) - state.age).astype(jnp.float32)
-    due = jnp.where(layout.has_comms | (due > slots), _NEVER, due)
+    due = _due(params, layout, state, covers, slots)
     freshness = jnp.argmin(due + _TIE_PER_M * away)
 
     drain = layout.standby_power * jnp.min(mean.duration) + mean.work
@@ -47,7 +46,21 @@ def earliest_deadline(params: Params, layout: Layout, state: State, key: PRNGKey
     battery = jnp.argmin(empties + _TIE_PER_M * away)
     here = jnp.where(jnp.min(away) <= 0.0, jnp.argmin(away), freshness)
     spare = jnp.where(jnp.any(services > 0), battery, here)
-    return jnp.where(_can_wait(charged, due), spare, freshness).astype(jnp.int32)
+    return jnp.where(_can_wait(due), spare, freshness).astype(jnp.int32)
+
+
+def _due(params: Params, layout: Layout, state: State, covers: Bool[Array, "n n"], slots: Any) -> Float[Array, " n"]:
+    """Slots until each hover point must be visited; ``_NEVER`` where nothing falls due within ``slots`` slots.
+
+    Every device without communication is fetched from the hover point that serves most of them, so devices that can
+    share a visit always do, and share their deadline.
+    """
+    calls = ~layout.has_comms
+    together = jnp.sum(covers & calls, axis=1)
+    hover = jnp.argmax(jnp.where(covers, together[:, None], -1), axis=0)
+    left = (slots_to_expiry(params) - state.age).astype(jnp.float32)
+    left = jnp.where(calls & (left <= slots), left, _NEVER)
+    return jnp.min(jnp.where(hover == jnp.arange(hover.shape[0])[:, None], left, _NEVER), axis=1)
 
 
 def _hoped_for(
@@ -78,7 +91,7 @@ def _hoped_for(
     return slots, services(slots)
 
 
-def _can_wait(charged: Float[Array, " n"], due: Float[Array, " n"]) -> Bool[Array, ""]:
+def _can_wait(due: Float[Array, " n"]) -> Bool[Array, ""]:
     """Whether a slot may be spent on something else: all data can then still be fetched before they expire."""
-    load = jnp.sum(jnp.where(due <= due[:, None], charged, 0.0), axis=-1)
-    return jnp.all((due == _NEVER) | (load + 1.0 <= due + 1e-4))
+    load = jnp.sum(due <= due[:, None], axis=-1)
+    return jnp.all((due == _NEVER) | (load + 1.0 <= due))

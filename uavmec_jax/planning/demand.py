@@ -93,10 +93,12 @@ class BatteryDemand:
     Attributes:
         drain: ``[n]`` J, used by each device if it is never served (0 with grid power).
         saved: ``[H + 1, n]`` J, the most that 0, 1, ... H services can save.
+        slots: int, the number of slots, ``last - first``.
     """
 
     drain: Any
     saved: Any
+    slots: Any
 
 
 def battery_demand(layout: Layout, costs: SlotCosts, first: Int[Array, ""] | int, last: Any) -> BatteryDemand:
@@ -108,6 +110,7 @@ def battery_demand(layout: Layout, costs: SlotCosts, first: Int[Array, ""] | int
     return BatteryDemand(
         drain=jnp.sum(jnp.where(counts, drain, 0.0), axis=0),
         saved=jnp.concatenate([jnp.zeros_like(saving[:1]), jnp.cumsum(saving, axis=0)]),
+        slots=jnp.maximum(last - first, 0),
     )
 
 
@@ -122,10 +125,15 @@ def battery_visits(
         hopeless: not even a service in every slot is enough.
     """
     missing = jnp.where(layout.has_power, -1.0, demand.drain * (1.0 - _ROUNDING) - battery)
-    steps = jnp.diff(demand.saved, axis=0)
-    beyond = missing[..., None, :] - demand.saved[:-1]
-    whole = jnp.sum(beyond >= 0.0, axis=-2, dtype=jnp.float32)
-    part = jnp.sum(jnp.clip(beyond / jnp.maximum(steps, 1e-3), 0.0, 1.0), axis=-2)
+    per_step = 1.0 / jnp.maximum(jnp.diff(demand.saved, axis=0), 1e-3)
+
+    def count(visits: Any, counted: tuple[Array, Array]) -> tuple[Array, Array]:
+        whole, part = counted
+        beyond = missing - demand.saved[visits]
+        return whole + (beyond >= 0.0), part + jnp.clip(beyond * per_step[visits], 0.0, 1.0)
+
+    # A loop over the slots that are left: much shorter than the table, which is as long as the longest life.
+    whole, part = jax.lax.fori_loop(0, demand.slots, count, (jnp.zeros_like(missing), jnp.zeros_like(missing)))
     return whole, part, missing >= demand.saved[-1]
 
 

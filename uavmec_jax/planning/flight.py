@@ -29,7 +29,7 @@ class Rounds:
 
     def __init__(self, position: np.ndarray, covers: np.ndarray, calls: np.ndarray, to_expiry: int) -> None:
         called = np.flatnonzero(calls)[:MOST_DEVICES]
-        serves = covers[:, called] @ (1 << np.arange(len(called)))
+        serves = covers[:, called].astype(int) @ (1 << np.arange(len(called)))
         hover = np.flatnonzero(serves)
         self._serves, self._everyone = serves[hover], (1 << len(called)) - 1
         self._from_start = np.linalg.norm(position[hover], axis=-1)

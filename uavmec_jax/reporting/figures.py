@@ -14,11 +14,22 @@ from uavmec_jax.studies.paper import TABLE5
 from uavmec_jax.studies.results import Results
 
 PANELS = (("best", "DQN, best weights"), ("last", "DQN, last weights"), ("oldest_first", "oldest data first"))
+LADDER = {
+    "oldest_first_planned": "oldest data first",
+    "earliest_deadline_planned": "earliest deadline",
+    "best_planned": "DQN, best weights",
+    "rollout_planned": "rollout planner",
+    "beam_planned": "clairvoyant beam",
+    "bound_planned": "upper bound",
+}
+"""From what anyone would do to what nobody can pass."""
 
 
 def run_figure(results: Results) -> Figure:
     """The figure of a run: the grids of a power x comms study, else its training curves."""
-    return grid_figure(results) if is_grid(results) else curves_figure(results)
+    if is_grid(results):
+        return grid_figure(results) if results.curves else ladder_figure(results)
+    return curves_figure(results) if results.curves else ladder_figure(results)
 
 
 def save(figure: Figure, path: Path) -> None:
@@ -58,6 +69,30 @@ def grid_figure(results: Results) -> Figure:
     figure.suptitle(
         f"{results.study.name}: {len(cells)} cells x {seeds} seeds, {results.study.steps:,} steps each", fontsize=11
     )
+    return figure
+
+
+def ladder_figure(results: Results) -> Figure:
+    """Lifetimes on the planners' draws, from the heuristics up to the bound: heat maps of a grid, else bars."""
+    cells = results.cells()
+    panels = [(name, title) for name, title in LADDER.items() if name in cells]
+    scenarios = f"{len(cells)} cells x {int(cells['seeds'].min())} layouts"
+    if not is_grid(results):
+        figure = new_figure(7, 3.6)
+        axis = figure.subplots()
+        axis.barh([title for _, title in panels], [cells[name].mean() for name, _ in panels])
+        axis.set_xlabel("lifetime, slots")
+    else:
+        figure = new_figure(3.3 * len(panels), 3.6)
+        axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+        for axis, (name, title) in zip(axes, panels, strict=True):
+            table = cells.pivot(index="powered", columns="connected", values=name)
+            image = _heat_map(axis, table, (10.0, max(33.0, float(cells[[name for name, _ in panels]].max().max()))))
+            axis.set_title(f"{title}: {cells[name].mean():.1f}", fontsize=10)
+            axis.set_xlabel("connected devices")
+        axes[0].set_ylabel("powered devices")
+        figure.colorbar(image, ax=axes, label="lifetime, slots", shrink=0.8)
+    figure.suptitle(f"{results.study.name}: {scenarios}", fontsize=11)
     return figure
 
 

@@ -1,5 +1,6 @@
 """The live progress bar of a run."""
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -17,14 +18,15 @@ def progress_bar(console: Console, plan: Plan) -> Iterator[Callable[[News], None
         TextColumn("{task.description}"),
         BarColumn(),
         TaskProgressColumn(),
-        TextColumn("{task.fields[speed]} steps/s"),
+        TextColumn("{task.fields[speed]} {task.fields[unit]}/s"),
         TextColumn("episode {task.fields[length]} slots"),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=console) as bar:
-        task = bar.add_task("compiling", total=plan.total_steps, speed="-", length="-")
+        unit = "steps" if plan.total_steps else "scenarios"
+        task = bar.add_task("compiling", total=plan.total_steps or plan.agents, speed="-", length="-", unit=unit)
 
         def report(news: News) -> None:
             speed = bar.tasks[task].speed
@@ -33,7 +35,7 @@ def progress_bar(console: Console, plan: Plan) -> Iterator[Callable[[News], None
                 completed=news.steps,
                 description=f"block {news.block + 1}/{plan.blocks.count}",
                 speed=f"{speed:,.0f}" if speed else "-",
-                length=f"{news.mean_length:.1f}",
+                length="-" if math.isnan(news.mean_length) else f"{news.mean_length:.1f}",
             )
 
         yield report

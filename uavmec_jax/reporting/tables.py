@@ -24,14 +24,49 @@ def tables(results: Results) -> dict[str, Table]:
     cells = results.cells()
     if not is_grid(results):
         return {"Lifetime in slots, mean over the seeds ± 95 %": list_table(results, cells)}
+    trained = [name for name in ("best", "last") if name in results.policies]
     below = f"below: paper{' / oldest-first' * ('oldest_first' in results.policies)}"
-    shown = {
-        f"Lifetime in slots, `best` weights ± 95 %; {below}": grid_table(results, cells, "best"),
-        f"Lifetime in slots, `last` weights ± 95 %; {below}": grid_table(results, cells, "last"),
-    }
+    titles: dict[str, str] = {name: f"Lifetime in slots, `{name}` weights ± 95 %; {below}" for name in trained}
+    if not trained and results.shown in results.policies:
+        titles = {results.shown: f"Lifetime in slots, {_spoken(results.shown)} ± 95 %; {below}"}
+    shown = {title: grid_table(results, cells, name) for name, title in titles.items()}
     if "best_over_oldest" in cells:
         shown["Slots more than oldest-first on the same layouts ± 95 %: `best`; below: `last`"] = paired_table(cells)
-    return shown | {"First to fail (best weights): device, share of held-out episodes, all seeds": failure_table(cells)}
+    if results.gaps:
+        shown[gap_title(results)] = gap_table(results, cells)
+    first = f"First to fail ({_spoken(results.shown)}): device, share of held-out episodes, all seeds"
+    return shown | {first: failure_table(cells, results.shown)}
+
+
+def _spoken(policy: str) -> str:
+    """A policy's name as people write it."""
+    names = {
+        "best": "best weights",
+        "last": "last weights",
+        "rollout": "rollout planner",
+        "beam": "clairvoyant beam",
+        "bound": "upper bound",
+    }
+    return names.get(policy, policy.replace("_", "-"))
+
+
+def gap_title(results: Results) -> str:
+    """What the lines of a cell of :func:`gap_table` say."""
+    steps = "; ".join(f"{_spoken(lower)} to {_spoken(upper)}" for upper, lower in results.gaps)
+    return f"How far from the best possible, % (same layouts and volumes): {steps}"
+
+
+def gap_table(results: Results, cells: pd.DataFrame) -> Table:
+    """The steps from the shown policy up to the bound, each in percent of the lower one."""
+    return _grid(cells, lambda cell: Text("\n".join(f"{gap:+.1f}" for gap in gap_percent(results, cell).values())))
+
+
+def gap_percent(results: Results, cell: Any) -> dict[str, float]:
+    """Per step, e.g. ``beam_over_rollout``, how many percent the upper mean is above the lower one."""
+    return {
+        f"{upper}_over_{lower}": 100 * (cell[f"{upper}_planned"] / cell[f"{lower}_planned"] - 1)
+        for upper, lower in results.gaps
+    }
 
 
 def grid_table(results: Results, cells: pd.DataFrame, policy: str) -> Table:
@@ -72,18 +107,20 @@ def _half(low: float, high: float) -> str:
     return f" ±{(high - low) / 2:.1f}" if high == high else " ±?"
 
 
-def failure_table(cells: pd.DataFrame) -> Table:
-    """The device that fails first most often under the best weights, and in what share of the episodes."""
+def failure_table(cells: pd.DataFrame, policy: str = "best") -> Table:
+    """The device that fails first most often under a policy, and in what share of the episodes."""
 
     def first(cell: Any) -> Text:
-        text = Text(_first(cell), style="bold" if cell["best_first_device"] else "dim")
-        return text.append(f" {cell['best_first_share']:.0%}" * bool(cell["best_first_device"]), style="not bold dim")
+        device = cell[f"{policy}_first_device"]
+        text = Text(_first(cell, policy), style="bold" if device else "dim")
+        return text.append(f" {cell[f'{policy}_first_share']:.0%}" * bool(device), style="not bold dim")
 
     return _grid(cells, first)
 
 
-def _first(cell: Any) -> str:
-    return f"#{int(cell['best_first_device'])}" if cell["best_first_device"] else "UAV"
+def _first(cell: Any, policy: str) -> str:
+    device = int(cell[f"{policy}_first_device"])
+    return f"#{device}" if device else "UAV"
 
 
 def _grid(cells: pd.DataFrame, content: Any) -> Table:
@@ -107,6 +144,8 @@ def list_table(results: Results, cells: pd.DataFrame) -> Table:
         table.add_column(name, justify="right")
     for policy in results.policies:
         table.add_column(policy.replace("_", "-"), justify="right")
+    for upper, lower in results.gaps:
+        table.add_column(f"{lower.replace('_', '-')} to {upper}, %", justify="right")
     table.add_column("first to fail", justify="right")
     for _, cell in cells.iterrows():
         lifetimes = []
@@ -114,8 +153,14 @@ def list_table(results: Results, cells: pd.DataFrame) -> Table:
             interval = _half(cell[f"{policy}_low"], cell[f"{policy}_high"]) if policy in ("best", "last") else ""
             lifetimes.append(f"{cell[policy]:.1f}{interval}")
         place = [value if isinstance(value := cell[name], str) else f"{value:g}" for name in (*axes, "seeds")]
-        table.add_row(*place, *lifetimes, _first(cell))
+        gaps = [f"{gap:+.1f}" for gap in gap_percent(results, cell).values()]
+        table.add_row(*place, *lifetimes, *gaps, _first(cell, results.shown))
     return table
+
+
+def _step(gap: Any) -> str:
+    upper, lower = str(gap).split("_over_")
+    return f"{_spoken(lower)} to {_spoken(upper)}"
 
 
 def summary(results: Results) -> list[str]:
@@ -123,9 +168,22 @@ def summary(results: Results) -> list[str]:
     cells, run = results.cells(), results.run
     means = ", ".join(f"{name.replace('_', '-')} {cells[name].mean():.2f}" for name in results.policies)
     lines = [f"Mean over {len(cells)} cells, slots: {means}."]
+    if results.gaps:
+        draws = len(
+            next(values[0] for name, values in results.evaluation.items() if name == f"{results.gaps[0][0]}/lifetime")
+        )
+        ladder = [results.gaps[0][1], *(upper for upper, _ in results.gaps)]
+        means = ", ".join(f"{_spoken(name)} {cells[f'{name}_planned'].mean():.2f}" for name in ladder)
+        gaps = pd.DataFrame([gap_percent(results, cell) for _, cell in cells.iterrows()])
+        steps = ", ".join(f"{_step(name)} {gap.mean():.1f} (most {gap.max():.1f})" for name, gap in gaps.items())
+        lines.append(f"On the planners' draws ({draws} per layout): {means}. Gaps, %, mean over the cells: {steps}.")
     if "training_steps_per_second" in run:
         seconds = run["seconds"]
-        spent = ", ".join(f"{name} {seconds[name]:.0f} s" for name in ("compile", "train", "validate", "evaluate"))
+        spent = ", ".join(
+            f"{name} {seconds[name]:.0f} s"
+            for name in ("compile", "train", "validate", "evaluate", "plan")
+            if name in seconds
+        )
         lines.append(
             f"{run['agents_done']} of {run['agents']} agents, {run['environment_steps']:,} environment steps at "
             f"{run['training_steps_per_second']:,}/s; {spent}, in all {seconds['wall']:.0f} s."

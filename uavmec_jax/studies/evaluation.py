@@ -6,11 +6,15 @@ from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key
 
 from uavmec_jax.learning.algorithm import Agent, Algorithm
+from uavmec_jax.planning.beam import horizon
 from uavmec_jax.planning.heuristics import HEURISTICS
+from uavmec_jax.planning.parallel import bound_all, play_beam, play_rollout
+from uavmec_jax.studies.schema import Evaluation
 from uavmec_jax.world.physics import Cause
 from uavmec_jax.world.rollout import Episode, rollouts
 
@@ -65,7 +69,7 @@ def _device(share: np.ndarray) -> int:
 
 
 def judge(
-    algorithm: Algorithm,
+    algorithm: Algorithm | None,
     agents: Agent,
     keys: Key[Array, "A D"],
     weights: Mapping[str, Any],
@@ -74,13 +78,14 @@ def judge(
     """Play every policy on every agent's scenario.
 
     Args:
-        algorithm: makes policies from weights.
+        algorithm: makes policies from weights; ``None`` if there are none.
         agents: leaves ``[A, ...]``.
         keys: ``[A, D + 1]`` volume draws, from :func:`uavmec_jax.studies.study.evaluation_keys`.
         weights: name -> trained weights, leaves ``[A, ...]``.
         baselines: names in :data:`HEURISTICS`.
     """
-    episodes = {name: _play_learned(algorithm, agents, keys, trained) for name, trained in weights.items()}
+    learned = weights.items() if algorithm else ()
+    episodes = {name: _play_learned(algorithm, agents, keys, trained) for name, trained in learned}
     episodes |= _play_baselines(tuple(baselines), agents, keys)
     return {
         name: Judgement(
@@ -90,6 +95,80 @@ def judge(
         )
         for name, episode in episodes.items()
     }
+
+
+@dataclass(frozen=True)
+class PlannedJudgement:
+    """How a planner did on the first ``P`` held-out draws of ``A`` agents' scenarios.
+
+    Attributes:
+        lifetime: ``[A, P]`` int32 slots; of ``bound`` the lifetime that no policy passes.
+        cause: ``[A, P]`` int8, a :class:`Cause`; ``None`` for the bound.
+        first_failure: ``[A, P, n]`` f32; ``None`` for the bound.
+    """
+
+    lifetime: np.ndarray
+    cause: np.ndarray | None = None
+    first_failure: np.ndarray | None = None
+
+
+def judge_planners(
+    agents: Agent, keys: Key[Array, "A D"], settings: Evaluation, lifetimes: list[np.ndarray]
+) -> dict[str, PlannedJudgement]:
+    """Play the planners, and bound what any policy can reach, on the first held-out draws.
+
+    Args:
+        agents: leaves ``[A, ...]``.
+        keys: ``[A, D]`` the held-out draws.
+        settings: which planners, how many draws, how wide.
+        lifetimes: ``[A, D]`` of every policy that played the same draws; the bound starts from the longest.
+    """
+    draws = min(settings.planner_draws, keys.shape[1])
+    shape = (keys.shape[0], draws)
+    params, layouts = jax.tree.map(
+        lambda leaf: jnp.repeat(leaf, draws, axis=0), (agents.scenario.params, agents.scenario.layout)
+    )
+    keys = keys[:, :draws].reshape(-1)
+    slots = horizon(params, layouts)
+    judged = {}
+    if "rollout" in settings.planners:
+        judged["rollout"] = _planned(play_rollout(params, layouts, keys, samples=settings.rollout_samples), shape)
+    if "beam" in settings.planners:
+        judged["beam"] = _planned(play_beam(params, layouts, keys, slots=slots, width=settings.beam_width)[1], shape)
+    if "bound" in settings.planners:
+        lifetimes = [*lifetimes, *(judgement.lifetime for judgement in judged.values())]
+        reached = np.max([np.ones(shape), *(life[:, :draws] for life in lifetimes)], axis=0)
+        found = bound_all(params, layouts, keys, reached.reshape(-1), slots=slots)
+        judged["bound"] = PlannedJudgement(lifetime=found.reshape(shape))
+    return judged
+
+
+def _planned(episodes: Episode, shape: tuple[int, int]) -> PlannedJudgement:
+    return PlannedJudgement(
+        lifetime=np.asarray(episodes.length).reshape(shape),
+        cause=np.asarray(episodes.cause, np.int8).reshape(shape),
+        first_failure=np.asarray(episodes.first_failure).reshape(*shape, -1),
+    )
+
+
+def planned_columns(
+    judgements: Mapping[str, Judgement], planned: Mapping[str, PlannedJudgement]
+) -> dict[str, np.ndarray | list]:
+    """Columns of the tidy table: mean lifetimes of everyone on the planners' draws, and who fails first under them."""
+    if not planned:
+        return {}
+    draws = next(iter(planned.values())).lifetime.shape[1]
+    columns: dict[str, np.ndarray | list] = {}
+    everyone: Mapping[str, Judgement | PlannedJudgement] = {**judgements, **planned}
+    for name, anyone in everyone.items():
+        columns[f"{name.replace('-', '_')}_planned"] = anyone.lifetime[:, :draws].mean(axis=1)
+    for name, judged in planned.items():
+        if judged.cause is not None and judged.first_failure is not None:
+            often = judged.first_failure.mean(axis=1)
+            columns[f"{name}_cause"] = [_commonest(causes) for causes in judged.cause]
+            columns[f"{name}_first_device"] = [_device(row) for row in often]
+            columns[f"{name}_first_share"] = often.max(axis=1)
+    return columns
 
 
 # Jitted here and not inside `judge`, so that the blocks of a run share one compilation.

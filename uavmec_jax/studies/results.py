@@ -21,6 +21,9 @@ from uavmec_jax.studies.study import cell_axes, load_study, study_toml
 SCHEMA = 1
 """Version of the run folder."""
 
+PLANNERS = ("rollout", "beam", "bound")
+"""From what a UAV can do to what nobody can pass."""
+
 _STUDY, _RUN, _AGENTS = "study.toml", "run.json", "agents.csv"
 _CURVES, _EVALUATION, _WEIGHTS = "curves.npz", "evaluation.npz", "weights.npz"
 
@@ -34,7 +37,8 @@ class Results:
         run: what ``run.json`` holds: versions, hardware, command, seeds, times, speed.
         agents: tidy table, one row per finished agent.
         curves: ``chunk_steps [C]``, ``episode_length [A, C]``, ``look_steps [L]``, ``validation [A, L]``.
-        evaluation: per policy ``<name>/lifetime [A, D + 1]``, ``/cause``, ``/first_failure [A, D + 1, n]``.
+        evaluation: per policy ``<name>/lifetime [A, D + 1]``, ``/cause``, ``/first_failure [A, D + 1, n]``; of the
+            planners ``[A, P]`` and ``[A, P, n]``, the bound has lifetimes only.
         weights: ``best/...`` and ``last/...``, leaves ``[A, ...]`` (empty when read back by :func:`load_results`).
     """
 
@@ -49,6 +53,18 @@ class Results:
     def policies(self) -> list[str]:
         """Policies in the table, as in its column names."""
         return [name.removesuffix("_lifetime") for name in self.agents.columns if name.endswith("_lifetime")]
+
+    @property
+    def shown(self) -> str:
+        """The policy that the tables are about: the best weights, or, where nothing was trained, the best heuristic."""
+        preferred = ("best", "earliest_deadline", *self.policies, *PLANNERS)
+        return next((name for name in preferred if f"{name}_first_device" in self.agents), "bound")
+
+    @property
+    def gaps(self) -> list[tuple[str, str]]:
+        """Pairs ``(upper, lower)`` of neighbours on the way from the shown policy to the upper bound."""
+        ladder = [name for name in (self.shown, *PLANNERS) if f"{name}_planned" in self.agents]
+        return list(zip(ladder[1:], ladder, strict=False))
 
     @property
     def _over_oldest(self) -> list[str]:
@@ -74,11 +90,19 @@ class Results:
                 row |= {policy: mean, f"{policy}_low": low, f"{policy}_high": high}
                 row[f"{policy}_fixed"] = float(group[f"{policy}_lifetime_fixed"].mean())
                 share = self.first_failures(policy)[group.index].mean(axis=0)
-                row[f"{policy}_first_device"] = int(share.argmax()) + 1 if share.max() > 0 else 0
-                row[f"{policy}_first_share"] = float(share.max())
+                row |= _first_to_fail(policy, share)
             for policy in self._over_oldest:
                 paired = (group[f"{policy}_lifetime"] - group["oldest_first_lifetime"]).to_numpy()
                 names = (f"{policy}_over_oldest", f"{policy}_over_oldest_low", f"{policy}_over_oldest_high")
+                row |= dict(zip(names, mean_interval(paired), strict=True))
+            for name in group.columns[group.columns.str.endswith("_planned")]:
+                row[name] = float(group[name].mean())
+            for planner in (name for name in PLANNERS if f"{name}/first_failure" in self.evaluation):
+                share = self.evaluation[f"{planner}/first_failure"][group.index].mean(axis=(0, 1))
+                row |= _first_to_fail(planner, share)
+            for upper, lower in self.gaps:
+                paired = (group[f"{upper}_planned"] - group[f"{lower}_planned"]).to_numpy()
+                names = (f"{upper}_over_{lower}", f"{upper}_over_{lower}_low", f"{upper}_over_{lower}_high")
                 row |= dict(zip(names, mean_interval(paired), strict=True))
             rows.append(row)
         return pd.DataFrame(rows)
@@ -97,6 +121,12 @@ class Results:
         for name, arrays in ((_CURVES, self.curves), (_EVALUATION, self.evaluation), (_WEIGHTS, self.weights)):
             _write(directory / name, partial(_save_arrays, arrays=arrays))
         _write(directory / _RUN, lambda file: file.write((json.dumps(self.run, indent=1) + "\n").encode()))
+
+
+def _first_to_fail(policy: str, share: np.ndarray) -> dict[str, Any]:
+    """The device (from 1, 0 for none) that is first most often, of ``share [n]``."""
+    device = int(share.argmax()) + 1 if share.max() > 0 else 0
+    return {f"{policy}_first_device": device, f"{policy}_first_share": float(share.max())}
 
 
 def _write(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:

@@ -3,7 +3,7 @@
 import datetime
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from uavmec_jax.learning.algorithm import Agent, Algorithm
 from uavmec_jax.learning.blocks import Blocks, PopulationTooLargeError, plan_blocks
 from uavmec_jax.learning.population import Progress, TrainedBlock, Validation
 from uavmec_jax.studies import host
-from uavmec_jax.studies.evaluation import judge
+from uavmec_jax.studies.evaluation import Judgement, PlannedJudgement, judge, judge_planners, planned_columns
 from uavmec_jax.studies.results import SCHEMA, Results, holds_run
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.studies.study import (
@@ -41,6 +41,8 @@ class Plan:
     free_bytes: int
 
     def __str__(self) -> str:
+        if not self.total_steps:
+            return f"{self.agents} scenarios, nothing is trained"
         blocks = f"{self.blocks.count} block{'s' * (self.blocks.count > 1)} of {self.blocks.size}"
         memory = f"{self.blocks.bytes / 2**30:.2f} GiB of {self.free_bytes / 2**30:.1f} GiB free"
         devices = f"{self.blocks.devices} device{'s' * (self.blocks.devices > 1)}"
@@ -60,12 +62,19 @@ def plan_study(study: Study) -> Plan:
             f"{study.name}: {agents:,} agents need {needed / 2**30:,.0f} GiB before any of them trains, "
             f"{free / 2**30:.1f} GiB are free; shorten an axis"
         )
+    if algorithm is None:
+        size = min(_UNTRAINED_BLOCK, agents)
+        blocks = Blocks(count=-(-agents // size), size=size, devices=jax.local_device_count(), bytes=0)
+        return Plan(agents=agents, total_steps=0, blocks=blocks, free_bytes=free)
     try:
         blocks = plan_blocks(agents, algorithm.agent_bytes, free - needed)
     except PopulationTooLargeError as error:
         raise StudyError(f"{study.name}: steps is {study.steps}: {error}") from None
     return Plan(agents=agents, total_steps=agents * algorithm.total_steps, blocks=blocks, free_bytes=free)
 
+
+_UNTRAINED_BLOCK = 100
+"""Scenarios between two savings where nothing is trained."""
 
 _BYTES_WITHOUT_TRAINING = 100_000
 """An agent that waits for its block or is done: layout, keys, two sets of weights, evaluation."""
@@ -111,23 +120,23 @@ def run_study(
     results = Results(study=study, run=_label(study, plan, command))
     algorithm, agents = make_algorithm(study), make_agents(study)
     keys = evaluation_keys(study)
-    validation = Validation(every=study.evaluation.validate_every, draws=study.evaluation.validation_draws)
     who = pd.DataFrame(identities(study))
-    seconds: dict[str, float] = {"evaluate": 0.0}
+    seconds: dict[str, float] = {"evaluate": 0.0, "plan": 0.0}
+    blocks: Iterator[TrainedBlock | slice]
+    if algorithm is None:
+        blocks = _untrained(plan, on_progress)
+    else:
+        validation = Validation(every=study.evaluation.validate_every, draws=study.evaluation.validation_draws)
+        looks = validation_keys(study)
+        blocks = population.train(
+            algorithm, agents, looks, validation=validation, blocks=plan.blocks, on_progress=on_progress
+        )
     try:
-        for block in population.train(
-            algorithm,
-            agents,
-            validation_keys(study),
-            validation=validation,
-            blocks=plan.blocks,
-            on_progress=on_progress,
-        ):
-            tick = time.perf_counter()
-            _finish(results, algorithm, agents, keys, block, who)
-            seconds["evaluate"] += time.perf_counter() - tick
-            for activity, spent in block.seconds.items():
-                seconds[activity] = seconds.get(activity, 0.0) + spent
+        for block in blocks:
+            _finish(results, algorithm, agents, keys, block, who, seconds)
+            if isinstance(block, TrainedBlock):
+                for activity, spent in block.seconds.items():
+                    seconds[activity] = seconds.get(activity, 0.0) + spent
             _measure(results, algorithm, plan, seconds, time.perf_counter() - started)
             if directory is not None:
                 results.save(directory)
@@ -136,28 +145,54 @@ def run_study(
     return results
 
 
+def _untrained(plan: Plan, on_progress: Callable[[Progress], None]) -> Iterator[slice]:
+    """The blocks of a study that trains nothing; progress counts scenarios."""
+    for block in range(plan.blocks.count):
+        done = slice(block * plan.blocks.size, min((block + 1) * plan.blocks.size, plan.agents))
+        yield done
+        on_progress(Progress(block, done.stop, plan.agents, float("nan")))
+
+
 def _finish(
-    results: Results, algorithm: Algorithm, agents: Agent, keys: Any, block: TrainedBlock, who: pd.DataFrame
+    results: Results,
+    algorithm: Algorithm | None,
+    agents: Agent,
+    keys: Any,
+    block: TrainedBlock | slice,
+    who: pd.DataFrame,
+    seconds: dict[str, float],
 ) -> None:
-    """Judge a trained block and add it to the results."""
-    members = jax.tree.map(lambda leaf: leaf[block.agents], agents)
-    weights = {"best": block.best, "last": block.last}
-    baselines = results.study.evaluation.baselines
-    judgements = judge(algorithm, members, keys[block.agents], weights, baselines)
-    rows = who.iloc[block.agents].reset_index(drop=True)
-    rows = rows.assign(
-        steps=algorithm.total_steps,
-        diverged_at=block.diverged_at,
-        best_step=block.best_step,
-        best_validation=block.best_score,
-    )
+    """Judge a block, trained or not, and add it to the results."""
+    place = block if isinstance(block, slice) else block.agents
+    members = jax.tree.map(lambda leaf: leaf[place], agents)
+    rows = who.iloc[place].reset_index(drop=True)
+    weights: dict[str, Any] = {}
+    curves: dict[str, Any] = {}
+    if isinstance(block, TrainedBlock):
+        weights = {"best": block.best, "last": block.last}
+        curves = {name: getattr(block, name) for name in ("chunk_steps", "episode_length", "look_steps", "validation")}
+        rows = rows.assign(
+            steps=algorithm.total_steps if algorithm else 0,
+            diverged_at=block.diverged_at,
+            best_step=block.best_step,
+            best_validation=block.best_score,
+        )
+    settings = results.study.evaluation
+    tick = time.perf_counter()
+    judgements = judge(algorithm, members, keys[place], weights, settings.baselines)
+    tock = time.perf_counter()
+    planned = judge_planners(members, keys[place, :-1], settings, [judged.lifetime for judged in judgements.values()])
+    seconds["evaluate"] += tock - tick
+    seconds["plan"] += time.perf_counter() - tock
     columns = {name: values for policy, judged in judgements.items() for name, values in judged.columns(policy).items()}
+    columns |= planned_columns(judgements, planned)
+    everyone: dict[str, Judgement | PlannedJudgement] = {**judgements, **planned}
     evaluation = {
         f"{policy.replace('-', '_')}/{name}": values
-        for policy, judged in judgements.items()
-        for name, values in asdict(judged).items()
+        for policy, anyone in everyone.items()
+        for name, values in asdict(anyone).items()
+        if values is not None
     }
-    curves = {name: getattr(block, name) for name in ("chunk_steps", "episode_length", "look_steps", "validation")}
     results.add(rows.assign(**columns), curves, evaluation, weights)
 
 
@@ -175,14 +210,18 @@ def _label(study: Study, plan: Plan, command: str | None) -> dict[str, Any]:
     }
 
 
-def _measure(results: Results, algorithm: Algorithm, plan: Plan, seconds: dict[str, float], wall: float) -> None:
+def _measure(results: Results, algorithm: Algorithm | None, plan: Plan, seconds: dict[str, float], wall: float) -> None:
     done = len(results.agents)
     results.run |= {
         "complete": done == plan.agents,
         "agents_done": done,
-        "diverged": int((results.agents["diverged_at"] >= 0).sum()),
-        "environment_steps": done * algorithm.total_steps,
         "seconds": {name: round(spent, 2) for name, spent in seconds.items()} | {"wall": round(wall, 2)},
-        "training_steps_per_second": round(done * algorithm.total_steps / seconds["train"]),
-        "validation_share": round(seconds["validate"] / (seconds["train"] + seconds["validate"]), 4),
     }
+    if algorithm is not None:
+        steps = done * algorithm.total_steps
+        results.run |= {
+            "diverged": int((results.agents["diverged_at"] >= 0).sum()),
+            "environment_steps": steps,
+            "training_steps_per_second": round(steps / seconds["train"]),
+            "validation_share": round(seconds["validate"] / (seconds["train"] + seconds["validate"]), 4),
+        }

@@ -5,12 +5,14 @@ The numbers of Table 1 and the hyperparameters are declared once, as pytrees (:c
 """
 
 import dataclasses
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import pydantic
 from pydantic import Field
 
 from uavmec_jax.learning.dqn import DQNHyper, DQNSpec
+from uavmec_jax.planning.beam import WIDTH as BEAM_WIDTH
+from uavmec_jax.planning.lookahead import SAMPLES as ROLLOUT_SAMPLES
 from uavmec_jax.world.params import Params
 from uavmec_jax.world.rewards import DEFAULT_REWARD, LOG_GUARDS, REWARDS, TERMS
 from uavmec_jax.world.settings import ParamsSettings, Strict, nearest, settings_model, wanted
@@ -24,6 +26,17 @@ TRACED_PARAMS = tuple(field.name for field in dataclasses.fields(Params) if isin
 TRACED_PARAMS = tuple(name for name in TRACED_PARAMS if name != "n_devices")
 """Scenario parameters that may be axes of a study."""
 
+Heuristic = Literal[
+    "stay-put",
+    "random",
+    "round-robin",
+    "oldest-first",
+    "lowest-battery",
+    "shortest-life",
+    "shortest-tour",
+    "earliest-deadline",
+]
+
 
 class Evaluation(Strict):
     """How policies are judged."""
@@ -33,12 +46,14 @@ class Evaluation(Strict):
     validate_every: Annotated[int, Field(ge=1)] = 10_000
     """Environment steps of one agent between looks at the greedy policy."""
     validation_draws: Annotated[int, Field(ge=1, le=1000)] = 16
-    baselines: tuple[Literal["stay-put", "random", "round-robin", "oldest-first"], ...] = (
-        "stay-put",
-        "random",
-        "round-robin",
-        "oldest-first",
-    )
+    baselines: tuple[Heuristic, ...] = get_args(Heuristic)
+    """Heuristics that play the same draws as the trained policies."""
+    planners: tuple[Literal["rollout", "beam", "bound"], ...] = ("rollout", "beam", "bound")
+    """What says how far from the best possible the policies are; see ``docs/planning.md``."""
+    planner_draws: Annotated[int, Field(ge=1, le=10_000)] = 8
+    """The planners play the first of the held-out draws, this many (all of them if there are fewer)."""
+    rollout_samples: Annotated[int, Field(ge=1, le=1000)] = ROLLOUT_SAMPLES
+    beam_width: Annotated[int, Field(ge=1, le=100_000)] = BEAM_WIDTH
 
 
 class Study(Strict):
@@ -46,7 +61,8 @@ class Study(Strict):
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=80)] = "study"
     description: str = ""
-    algorithm: Literal["dqn"] = "dqn"
+    algorithm: Literal["dqn", "none"] = "dqn"
+    """``none`` trains nothing: heuristics and planners alone."""
     reward: str | dict[str, float] = DEFAULT_REWARD
     guard: Literal["clamp", "log1p"] = "clamp"
     steps: Annotated[int, Field(ge=1, le=2_000_000_000)] = 1_000_000

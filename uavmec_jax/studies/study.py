@@ -134,8 +134,10 @@ def n_agents(study: Study) -> int:
     return math.prod(lengths) * (seeds if isinstance(seeds, int) else 1)
 
 
-def make_algorithm(study: Study) -> Algorithm:
-    """The study's algorithm with its static settings."""
+def make_algorithm(study: Study) -> Algorithm | None:
+    """The study's algorithm with its static settings; ``None`` if the study trains nothing."""
+    if study.algorithm == "none":
+        return None
     names = {field.name for field in dataclasses.fields(dqn.DQNSpec)}
     settings = {name: value for name, value in study.dqn.model_dump().items() if name in names}
     limits = study.axes.get("data_age_limit_slots", [study.params.data_age_limit_slots])

@@ -1,0 +1,80 @@
+"""Plan for many scenarios at once: split over the local devices, on each one after the other or in batches."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, Key
+
+from uavmec_jax.planning.beam import beam_search
+from uavmec_jax.planning.bound import upper_bounds
+from uavmec_jax.planning.lookahead import rollout_planner
+from uavmec_jax.world.layout import Layout
+from uavmec_jax.world.params import Params
+from uavmec_jax.world.rollout import Episode, Policy, rollout, tour_policy, volume_table
+
+_ACCELERATOR_BATCH = 256
+"""Scenarios planned for at once on an accelerator. A CPU core takes one at a time and keeps it in its cache."""
+
+
+@partial(jax.jit, static_argnames=("slots", "width"))
+def play_beam(
+    params: Params, layouts: Layout, keys: Key[Array, " B"], *, slots: int, width: int
+) -> tuple[Any, Episode]:
+    """The beam's tour for each of ``B`` scenarios, and the episode that it makes; clairvoyant.
+
+    Args:
+        params: leaves ``[B]``.
+        layouts: leaves ``[B, n]``.
+        keys: volume draws.
+        slots: from :func:`uavmec_jax.planning.beam.horizon`.
+        width: states kept per slot.
+    """
+
+    def one(params: Params, layout: Layout, key: Key[Array, ""]) -> tuple[Array, Episode]:
+        volumes = volume_table(params, layout.capacity.shape[0], key, slots)
+        plan = beam_search(params, layout, volumes, width)
+        return plan.actions, rollout(tour_policy(plan.actions), params, layout, key)
+
+    return spread(one, params, layouts, keys)
+
+
+@partial(jax.jit, static_argnames=("samples", "base"))
+def play_rollout(
+    params: Params, layouts: Layout, keys: Key[Array, " B"], *, samples: int, base: Policy | None = None
+) -> Episode:
+    """Episodes ``[B]`` of the rollout planner (see :func:`rollout_planner`); otherwise as :func:`play_beam`."""
+    policy = rollout_planner(samples=samples) if base is None else rollout_planner(base, samples)
+    return spread(partial(rollout, policy), params, layouts, keys)
+
+
+def bound_all(
+    params: Params, layouts: Layout, keys: Key[Array, " B"], at_least: np.ndarray, *, slots: int
+) -> np.ndarray:
+    """Upper bounds ``[B]`` int32 of ``B`` scenarios; ``at_least [B]`` are lifetimes that were reached."""
+    return upper_bounds(params, layouts, _tables(params, layouts, keys, slots), at_least)
+
+
+@partial(jax.jit, static_argnames="slots")
+def _tables(params: Params, layouts: Layout, keys: Key[Array, " B"], slots: int) -> Array:
+    n = layouts.capacity.shape[1]
+    return jax.vmap(lambda params, key: volume_table(params, n, key, slots))(params, keys)
+
+
+def spread(function: Callable, *arguments: Any) -> Any:
+    """``vmap(function)(*arguments)`` over the leading axis, split over the local devices; call under ``jit``."""
+    devices = jax.local_devices()
+    count = jax.tree.leaves(arguments)[0].shape[0]
+    missing = -count % len(devices)
+    if missing:
+        arguments = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf[:1].repeat(missing, 0)]), arguments)
+    mesh, split = Mesh(devices, ("scenarios",)), PartitionSpec("scenarios")
+    batch = None if devices[0].platform == "cpu" else _ACCELERATOR_BATCH
+    in_turn = lambda *shard: jax.lax.map(lambda one: function(*one), shard, batch_size=batch)  # noqa: E731
+    # check_vma: the loops end when each device's own scenarios end, which the checker has no type for.
+    mapped = jax.shard_map(in_turn, mesh=mesh, in_specs=(split,) * len(arguments), out_specs=split, check_vma=False)
+    return jax.tree.map(lambda leaf: leaf[:count], mapped(*arguments))
