@@ -9,6 +9,7 @@ batteries are served in the slots that the ages can spare, and just as many of t
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
@@ -82,12 +83,11 @@ def _hoped_for(
         return (need @ charged <= slots) & jnp.all(need <= slots) & (slots * base * shortest <= state.uav_energy)
 
     # Bisection: what fits into a number of slots fits into fewer.
-    slots = jnp.float32(0.0)
-    step = LOOKAHEAD // 2
-    while step:
-        slots = jnp.where(fits(slots + step), slots + step, slots)
-        step //= 2
-    slots = jnp.maximum(slots, 1.0)
+    def halve(step: Any, slots: Array) -> Array:
+        longer = slots + LOOKAHEAD / 2.0 ** (step + 1)
+        return jnp.where(fits(longer), longer, slots)
+
+    slots = jnp.maximum(jax.lax.fori_loop(0, LOOKAHEAD.bit_length() - 1, halve, jnp.float32(0.0)), 1.0)
     return slots, services(slots)
 
 

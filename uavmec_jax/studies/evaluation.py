@@ -86,7 +86,10 @@ def judge(
     """
     learned = weights.items() if algorithm else ()
     episodes = {name: _play_learned(algorithm, agents, keys, trained) for name, trained in learned}
-    episodes |= _play_baselines(tuple(baselines), agents, keys)
+    names = tuple(baselines)
+    if names:
+        played = _play_baselines(names, agents, keys)
+        episodes |= {name: jax.tree.map(lambda leaf, k=k: leaf[k], played) for k, name in enumerate(names)}
     return {
         name: Judgement(
             lifetime=np.asarray(episode.length),
@@ -182,9 +185,16 @@ def _play_learned(algorithm: Algorithm, agents: Agent, keys: Key[Array, "A D"], 
 
 
 @partial(jax.jit, static_argnames="names")
-def _play_baselines(names: tuple[str, ...], agents: Agent, keys: Key[Array, "A D"]) -> dict[str, Episode]:
-    def one(agent: Agent, draws: Key[Array, " D"]) -> dict[str, Episode]:
-        world = (agent.scenario.params, agent.scenario.layout, draws)
-        return {name: rollouts(HEURISTICS[name], *world) for name in names}
+def _play_baselines(names: tuple[str, ...], agents: Agent, keys: Key[Array, "A D"]) -> Episode:
+    """Episodes ``[K, A, D]`` of ``K`` heuristics: one after the other through one compiled slot."""
 
-    return jax.vmap(one)(agents, keys)
+    def play(index: Array) -> Episode:
+        def policy(*arguments: Any) -> Array:
+            return jax.lax.switch(index, [HEURISTICS[name] for name in names], *arguments)
+
+        def one(agent: Agent, draws: Key[Array, " D"]) -> Episode:
+            return rollouts(policy, agent.scenario.params, agent.scenario.layout, draws)
+
+        return jax.vmap(one)(agents, keys)
+
+    return jax.lax.map(play, jnp.arange(len(names)))
