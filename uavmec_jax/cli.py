@@ -35,6 +35,7 @@ def main() -> None:
     \b
     uavmec run table5 --quick     the paper's Table 5 on this machine, in under a minute
     uavmec run my-study.toml      a study of your own
+    uavmec plan my-town.toml      tours for your own devices, what fails first, what to repair
     uavmec show runs/...          the tables of a run again
     """
 
@@ -102,6 +103,61 @@ def run(
         kept = f"{done} finished agents are kept in {directory}" if done else "no block was finished, nothing was kept"
         click.echo(f"interrupted: {kept}", err=True)
         sys.exit(130)
+
+
+@main.command()
+@click.argument("scenario", required=False, type=click.Path(path_type=Path))
+@click.option("--powered", type=int, help="Devices with grid power, of a random town (default: 8).")
+@click.option("--connected", type=int, help="Devices with communication, of a random town (default: 8).")
+@click.option("--seed", type=int, default=0, help="Of the random town and of the task volumes.")
+@click.option("--draws", type=int, default=8, help="Volume draws that lifetimes are judged on (default: 8).")
+@click.option("--width", type=click.IntRange(1, 100_000), default=256, help="States the beam keeps (default: 256).")
+@click.option("--set", "settings", multiple=True, metavar="NAME=VALUE", help="Change a number of Table 1.")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder of the plan (default: runs/plan-<time>).")
+@click.option("--json", "as_json", is_flag=True, help="Print the plan as JSON on standard output.")
+def plan(
+    scenario: Path | None,
+    powered: int | None,
+    connected: int | None,
+    seed: int,
+    draws: int,
+    width: int,
+    settings: tuple[str, ...],
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Plan for SCENARIO, a layout file (TOML or CSV), or for a random town: tours, bound, first failure, repairs."""
+    if scenario is not None and (powered, connected) != (None, None):
+        _fail(f"{scenario}: says itself who has power and communication; leave out --powered and --connected")
+    from uavmec_jax.studies import host
+
+    host.use_every_core()
+    from rich.console import Console
+
+    from uavmec_jax.planning.outlook import look_ahead
+    from uavmec_jax.reporting.outlook import outlook_data, outlook_summary, outlook_tables, save_outlook
+    from uavmec_jax.studies.run import check_directory
+    from uavmec_jax.studies.scenario import load_scenario
+
+    inventory, keys = load_scenario(
+        scenario,
+        powered=8 if powered is None else powered,
+        connected=8 if connected is None else connected,
+        seed=seed,
+        draws=draws,
+        settings=dict(_setting(setting) for setting in settings),
+    )
+    directory = out or Path("runs") / f"plan-{time.strftime('%Y%m%d-%H%M%S')}"
+    check_directory(directory)
+    outlook = look_ahead(inventory.params, inventory.layout, keys, width=width)
+    save_outlook(outlook, inventory, directory, _command())
+    if as_json:
+        click.echo(json.dumps(outlook_data(outlook, inventory.names, inventory.file.name), indent=1))
+        return
+    console = Console()
+    _print_tables(
+        console, outlook_tables(outlook, inventory.names), outlook_summary(outlook, inventory.names), directory
+    )
 
 
 @main.command()
@@ -174,10 +230,14 @@ def _print(results: Any, directory: Path, console: Any, as_json: bool) -> None:
         cells = json.loads(results.cells().to_json(orient="records"))
         click.echo(json.dumps({"directory": str(directory), "run": results.run, "cells": cells}, indent=1))
         return
-    for title, table in tables(results).items():
+    _print_tables(console, tables(results), summary(results), directory)
+
+
+def _print_tables(console: Any, tables: dict[str, Any], lines: list[str], directory: Path) -> None:
+    for title, table in tables.items():
         console.print(f"[bold]{title}[/bold]")
         console.print(table)
-    for line in summary(results):
+    for line in lines:
         console.print(line, highlight=False)
     console.print(f"Files: {directory}", highlight=False, soft_wrap=True)
 

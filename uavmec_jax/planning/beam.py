@@ -28,7 +28,7 @@ WIDTH = 64
 
 
 @struct.dataclass
-class Plan:
+class Tour:
     """A tour and how long the network lives with it.
 
     Attributes:
@@ -88,7 +88,7 @@ def _longest(params: Params, layout: Layout) -> Int[Array, ""]:
 
 def beam_search(
     params: Params, layout: Layout, volumes: Num[Array, "H n"], width: int = WIDTH, at_most: Any = None
-) -> Plan:
+) -> Tour:
     """The longest life that the beam finds; clairvoyant in ``volumes``.
 
     Args:
@@ -112,7 +112,7 @@ def beam_search(
     nothing = jnp.full(volumes.shape[:1], -1, jnp.int32)
     # An attempt at one slot less is in vain once that much has been reached.
     _, lifetime, actions = jax.lax.while_loop(lambda carry: carry[1] < carry[0], attempt, (aim, jnp.int32(0), nothing))
-    return Plan(lifetime=lifetime, actions=actions, aim=aim)
+    return Tour(lifetime=lifetime, actions=actions, aim=aim)
 
 
 def counting_bound(params: Params, layout: Layout, costs: SlotCosts) -> Int[Array, ""]:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from uavmec_jax.planning.beam import Plan
+from uavmec_jax.planning.beam import Tour
 from uavmec_jax.world.layout import Layout
 from uavmec_jax.world.params import Params
 from uavmec_jax.world.physics import Cause, Outcome, State, initial_state, transition
@@ -19,7 +19,7 @@ from uavmec_jax.world.physics import Cause, Outcome, State, initial_state, trans
 MOST_STATES = 20_000
 
 
-def exact_plan(params: Params, layout: Layout, volumes: np.ndarray, most_states: int = MOST_STATES) -> Plan:
+def exact_tour(params: Params, layout: Layout, volumes: np.ndarray, most_states: int = MOST_STATES) -> Tour:
     """The longest life there is, with a tour that reaches it; clairvoyant in ``volumes [H, n]``.
 
     Raises:
@@ -45,7 +45,7 @@ def exact_plan(params: Params, layout: Layout, volumes: np.ndarray, most_states:
         states = jax.tree.map(lambda leaf, chosen=chosen: leaf[chosen], after)
         tours = tours[chosen // n]
         tours[:, slot] = chosen % n
-    return Plan(lifetime=np.int32(lifetime), actions=best, aim=np.int32(lifetime))
+    return Tour(lifetime=np.int32(lifetime), actions=best, aim=np.int32(lifetime))
 
 
 def _visit_all(params: Params, layout: Layout, states: State, volumes: np.ndarray) -> tuple[State, Outcome]:

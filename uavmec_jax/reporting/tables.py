@@ -28,17 +28,17 @@ def tables(results: Results) -> dict[str, Table]:
     below = f"below: paper{' / oldest-first' * ('oldest_first' in results.policies)}"
     titles: dict[str, str] = {name: f"Lifetime in slots, `{name}` weights ± 95 %; {below}" for name in trained}
     if not trained and results.shown in results.policies:
-        titles = {results.shown: f"Lifetime in slots, {_spoken(results.shown)} ± 95 %; {below}"}
+        titles = {results.shown: f"Lifetime in slots, {spoken(results.shown)} ± 95 %; {below}"}
     shown = {title: grid_table(results, cells, name) for name, title in titles.items()}
     if "best_over_oldest" in cells:
         shown["Slots more than oldest-first on the same layouts ± 95 %: `best`; below: `last`"] = paired_table(cells)
     if results.gaps:
         shown[gap_title(results)] = gap_table(results, cells)
-    first = f"First to fail ({_spoken(results.shown)}): device, share of held-out episodes, all seeds"
+    first = f"First to fail ({spoken(results.shown)}): device, share of held-out episodes, all seeds"
     return shown | {first: failure_table(cells, results.shown)}
 
 
-def _spoken(policy: str) -> str:
+def spoken(policy: str) -> str:
     """A policy's name as people write it."""
     names = {
         "best": "best weights",
@@ -52,7 +52,7 @@ def _spoken(policy: str) -> str:
 
 def gap_title(results: Results) -> str:
     """What the lines of a cell of :func:`gap_table` say."""
-    steps = "; ".join(f"{_spoken(lower)} to {_spoken(upper)}" for upper, lower in results.gaps)
+    steps = "; ".join(f"{spoken(lower)} to {spoken(upper)}" for upper, lower in results.gaps)
     return f"How far from the best possible, % (same layouts and volumes): {steps}"
 
 
@@ -160,7 +160,7 @@ def list_table(results: Results, cells: pd.DataFrame) -> Table:
 
 def _step(gap: Any) -> str:
     upper, lower = str(gap).split("_over_")
-    return f"{_spoken(lower)} to {_spoken(upper)}"
+    return f"{spoken(lower)} to {spoken(upper)}"
 
 
 def summary(results: Results) -> list[str]:
@@ -173,7 +173,7 @@ def summary(results: Results) -> list[str]:
             next(values[0] for name, values in results.evaluation.items() if name == f"{results.gaps[0][0]}/lifetime")
         )
         ladder = [results.gaps[0][1], *(upper for upper, _ in results.gaps)]
-        means = ", ".join(f"{_spoken(name)} {cells[f'{name}_planned'].mean():.2f}" for name in ladder)
+        means = ", ".join(f"{spoken(name)} {cells[f'{name}_planned'].mean():.2f}" for name in ladder)
         gaps = pd.DataFrame([gap_percent(results, cell) for _, cell in cells.iterrows()])
         steps = ", ".join(f"{_step(name)} {gap.mean():.1f} (most {gap.max():.1f})" for name, gap in gaps.items())
         lines.append(f"On the planners' draws ({draws} per layout): {means}. Gaps, %, mean over the cells: {steps}.")

@@ -114,13 +114,13 @@ class Results:
     def save(self, directory: Path) -> None:
         """Write every file of the run into ``directory``, each atomically; ``run.json`` last."""
         directory.mkdir(parents=True, exist_ok=True)
-        _write(directory / _STUDY, lambda file: file.write(study_toml(self.study).encode()))
-        _write(
+        write_file(directory / _STUDY, lambda file: file.write(study_toml(self.study).encode()))
+        write_file(
             directory / _AGENTS, lambda file: file.write(self.agents.to_csv(index=False, float_format="%.6g").encode())
         )
         for name, arrays in ((_CURVES, self.curves), (_EVALUATION, self.evaluation), (_WEIGHTS, self.weights)):
-            _write(directory / name, partial(_save_arrays, arrays=arrays))
-        _write(directory / _RUN, lambda file: file.write((json.dumps(self.run, indent=1) + "\n").encode()))
+            write_file(directory / name, partial(_save_arrays, arrays=arrays))
+        write_file(directory / _RUN, lambda file: file.write((json.dumps(self.run, indent=1) + "\n").encode()))
 
 
 def _first_to_fail(policy: str, share: np.ndarray) -> dict[str, Any]:
@@ -129,7 +129,7 @@ def _first_to_fail(policy: str, share: np.ndarray) -> dict[str, Any]:
     return {f"{policy}_first_device": device, f"{policy}_first_share": float(share.max())}
 
 
-def _write(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:
+def write_file(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:
     """Write a file whole or not at all."""
     partial = path.with_name(f".{path.name}.part")
     try:

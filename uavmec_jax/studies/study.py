@@ -170,9 +170,6 @@ def make_agents(study: Study) -> Agent:
             return tuple(jnp.full(len(who), part, jnp.float32) for part in value)
         return value if name == "n_devices" else leaf(name, value)
 
-    def town(seed: Any, params: Params, n_powered: Any, n_connected: Any) -> Layout:
-        return sample_layout(jax.random.fold_in(jax.random.key(_LAYOUT), seed), params, n_powered, n_connected)
-
     settings: dict[str, Any] = {name: spread(name, value) for name, value in study.params.model_dump().items()}
     params = Params(**settings)
     layout = jax.jit(jax.vmap(town))(seeds, params, powered, connected)
@@ -184,6 +181,17 @@ def make_agents(study: Study) -> Agent:
         scenario=Scenario(params=params, layout=layout, reward=reward),
         hyper=hyper,
     )
+
+
+def town(seed: Any, params: Params, n_powered: Any, n_connected: Any) -> Layout:
+    """The layout that a seed stands for in every study."""
+    return sample_layout(jax.random.fold_in(jax.random.key(_LAYOUT), seed), params, n_powered, n_connected)
+
+
+def held_out_draws(seed: int, powered: int, connected: int, draws: int) -> Any:
+    """``[draws]`` volume draws: the first ones that a study judges policies on in this cell and for this seed."""
+    numbers = np.array([[seed], [powered], [connected]], np.int32)
+    return jax.random.split(_agent_keys(_HELD_OUT, *numbers)[0], draws)
 
 
 def validation_keys(study: Study) -> Any:

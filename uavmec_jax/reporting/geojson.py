@@ -1,0 +1,47 @@
+"""A plan on the map: GeoJSON (RFC 7946) with the devices as points and the tours as lines."""
+
+from typing import Any
+
+import numpy as np
+
+from uavmec_jax.planning.outlook import Outlook
+from uavmec_jax.world.inventory import Inventory
+
+
+def plan_geojson(inventory: Inventory, outlook: Outlook) -> dict[str, Any]:
+    """A feature collection; longitude and latitude in degrees.
+
+    Raises:
+        LayoutError: the inventory has no place on the map.
+    """
+    devices = inventory.geographic(outlook.layout.position)
+    visits = {name: np.bincount(route.action, minlength=len(devices)) for name, route in outlook.routes.items()}
+    points = [
+        _feature(
+            "Point",
+            devices[i].tolist(),
+            {
+                "number": i + 1,
+                "name": name,
+                "power": bool(outlook.layout.has_power[i]),
+                "comms": bool(outlook.layout.has_comms[i]),
+                "fails_first_share": float(outlook.first_failure[i]),
+                **{f"visits_{tour}": int(count[i]) for tour, count in visits.items()},
+            },
+        )
+        for i, name in enumerate(inventory.names)
+    ]
+    lines = []
+    for name, route in outlook.routes.items():
+        stops = np.concatenate([np.zeros((1, 2)), outlook.layout.position[route.action]])
+        moved = np.append(True, np.any(np.diff(stops, axis=0) != 0, axis=1))
+        path = inventory.geographic(stops[moved]).tolist()
+        path = path if len(path) > 1 else path * 2  # a line has at least two positions
+        lifetime = float(outlook.lifetimes[name].mean())
+        properties = {"tour": name, "devices": [int(a) + 1 for a in route.action], "mean_lifetime_slots": lifetime}
+        lines.append(_feature("LineString", path, properties))
+    return {"type": "FeatureCollection", "features": [*points, *lines]}
+
+
+def _feature(kind: str, coordinates: list, properties: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": properties}

@@ -1,0 +1,58 @@
+"""One scenario to plan for: a layout file, or the town that a seed stands for in every study."""
+
+from pathlib import Path
+from typing import Any
+
+import pydantic
+from jaxtyping import Array, Key
+
+from uavmec_jax.errors import StudyError
+from uavmec_jax.studies.study import held_out_draws, town
+from uavmec_jax.world.inventory import Inventory, inventory_of
+from uavmec_jax.world.inventory_files import load_inventory
+from uavmec_jax.world.params import Params
+from uavmec_jax.world.settings import ParamsSettings, one_line
+
+MOST_DRAWS = 10_000
+
+
+def load_scenario(
+    source: Path | None,
+    *,
+    powered: int = 8,
+    connected: int = 8,
+    seed: int = 0,
+    draws: int = 8,
+    settings: dict[str, Any] | None = None,
+) -> tuple[Inventory, Key[Array, " D"]]:
+    """The devices to plan for, and the volume draws to judge a plan on.
+
+    Args:
+        source: a layout file; ``None`` for the town of ``seed`` with so many powered and connected devices, and the
+            draws that studies hold out for it.
+        powered: devices with grid power.
+        connected: devices with communication.
+        seed: of the town, and of the draws.
+        draws: how many.
+        settings: scenario parameters to change, by name.
+
+    Raises:
+        LayoutError: the layout file is not usable.
+        StudyError: a number does not fit.
+    """
+    settings = {name: tuple(v) if isinstance(v, list) else v for name, v in (settings or {}).items()}
+    for name, value, most in (("seed", seed, 2**31 - 1), ("draws", draws, MOST_DRAWS)):
+        if not (name == "draws") <= value <= most:
+            raise StudyError(f"--{name} is {value}; give a whole number from {int(name == 'draws')} to {most}")
+    if source is not None:
+        return load_inventory(source, settings), held_out_draws(seed, 0, 0, draws)
+    try:
+        params = Params(**ParamsSettings.model_validate(settings).model_dump())
+    except pydantic.ValidationError as error:
+        raise StudyError(one_line("--set", error, ParamsSettings)) from None
+    for name, count in (("powered", powered), ("connected", connected)):
+        if not 0 <= count <= params.n_devices:
+            raise StudyError(f"--{name} is {count}; give 0 to {params.n_devices}, the number of devices")
+    name = f"{powered} powered, {connected} connected, seed {seed}"
+    inventory = inventory_of(town(seed, params, powered, connected), params, name)
+    return inventory, held_out_draws(seed, powered, connected, draws)
