@@ -1,17 +1,33 @@
 """The baselines."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from tests.worlds import three_devices
-from uavmec_jax.planning.heuristics import HEURISTICS, oldest_first, random, round_robin, stay_put
+from uavmec_jax.planning.deadlines import earliest_deadline
+from uavmec_jax.planning.heuristics import (
+    HEURISTICS,
+    lowest_battery,
+    oldest_first,
+    random,
+    round_robin,
+    shortest_life,
+    stay_put,
+)
+from uavmec_jax.planning.lookahead import rollout_planner
+from uavmec_jax.planning.tour import shortest_tour, two_opt
+from uavmec_jax.studies.study import town
 from uavmec_jax.world.params import Params
 from uavmec_jax.world.physics import initial_state
+from uavmec_jax.world.rollout import rollout, trace
 
 PARAMS, LAYOUT = Params(n_devices=3), three_devices()
 START = initial_state(PARAMS, LAYOUT)
+START_12 = initial_state(Params(), town(3, Params(), 8, 8))
 
 
 def test_oldest_first_takes_the_oldest_and_the_lowest_number_on_ties():
@@ -44,3 +60,85 @@ def test_common_shape(name):
     actions = jax.jit(jax.vmap(lambda state, key: policy(PARAMS, LAYOUT, state, key)))(states, keys)
     assert actions.shape == (4,)
     assert actions.dtype == jnp.int32
+
+
+def test_lowest_battery_goes_by_fraction():
+    state = START.replace(battery=jnp.array([50_000.0, 30_000.0, 40_000.0]))
+    assert lowest_battery(PARAMS, LAYOUT, state) == 1
+    assert lowest_battery(PARAMS, LAYOUT, START) == 0
+
+
+def test_shortest_life_holds_batteries_against_ages():
+    # With 600 s slots at most: device 2 uses (4 + 2.5) W and its 60 kJ last longest of what is left; ages have 11 slots.
+    assert shortest_life(PARAMS, LAYOUT, START.replace(age=jnp.array([3, 8, 2]))) == 1
+    low = START.replace(battery=jnp.array([60_000.0, 60_000.0, 3_000.0]))
+    assert shortest_life(PARAMS, LAYOUT, low) == 2
+    assert shortest_life(PARAMS, LAYOUT.replace(has_power=jnp.array([True, True, True])), low) == 0
+
+
+def test_earliest_deadline_fetches_data_just_in_time_and_serves_batteries_meanwhile():
+    layout = town(3, Params(), 8, 8)
+    played = jax.jit(lambda key: trace(earliest_deadline, Params(), layout, key, 18))(jax.random.key(0))
+    visits = np.asarray(played.action)[np.asarray(played.played)]
+    unconnected = np.flatnonzero(~np.asarray(layout.has_comms))
+    assert np.asarray(played.state.age)[np.asarray(played.played)].max() <= 10
+    assert set(unconnected) <= set(visits[:11].tolist())
+    weakest = int(np.asarray(played.state.battery / layout.capacity)[-1].argmin())
+    assert not layout.has_power[weakest]
+    assert np.bincount(visits).argmax() == weakest  # what the ages can spare goes to the battery that empties first
+
+
+def test_earliest_deadline_rests_where_nothing_is_asked_for():
+    layout = town(0, Params(), 12, 12)
+    state = initial_state(Params(), layout).replace(uav_position=layout.position[7])
+    assert earliest_deadline(Params(), layout, state) == 7
+
+
+def test_devices_that_share_a_hover_point_share_a_visit():
+    # b sees a and c, who do not see each other: one visit at b serves all three.
+    chain = jnp.array([[100.0, 100.0], [150.0, 100.0], [200.0, 100.0]])
+    layout = three_devices(has_power=(True, True, True), position=chain)
+    state = START.replace(age=jnp.array([10, 10, 10]))
+    assert earliest_deadline(PARAMS, layout, state) == 1
+
+
+def test_shortest_tour_is_a_tour_through_the_needy():
+    layout = town(5, Params(), 6, 6)
+    needy = np.flatnonzero(~np.asarray(layout.has_power & layout.has_comms))
+    order = [int(shortest_tour(Params(), layout, START_12.replace(slot=jnp.int32(slot)))) for slot in range(len(needy))]
+    assert sorted(order) == needy.tolist()
+    position = np.asarray(layout.position)
+    best = min(length(position[[needy[0], *rest]]) for rest in itertools.permutations(needy[1:]) if len(needy) <= 9)
+    assert length(position[order]) <= 1.05 * best
+
+
+def length(stops):
+    return np.linalg.norm(stops - np.roll(stops, 1, axis=0), axis=1).sum()
+
+
+def test_two_opt_uncrosses():
+    square = jnp.array([[0.0, 0.0], [1.0, 1.0], [1.0, 0.0], [0.0, 1.0], [9.0, 9.0]])
+    tour = two_opt(square, jnp.arange(5), jnp.int32(4))
+    assert length(np.asarray(square)[np.asarray(tour)[:4]]) == pytest.approx(4.0)
+    assert tour[4] == 4
+
+
+def test_rollout_planner_knows_no_volumes_and_needs_a_key():
+    layout = town(3, Params(), 8, 8)
+    policy = rollout_planner(samples=2)
+    with pytest.raises(ValueError, match="needs a key"):
+        policy(Params(), layout, START_12)
+    first = jax.jit(lambda key: policy(Params(), layout, START_12, key))
+    # Its choice hangs on its own key alone: no volume is among its arguments.
+    assert first(jax.random.key(1)) == first(jax.random.key(1))
+
+
+def test_rollout_planner_improves_on_its_base():
+    layouts = [town(seed, Params(), 8, 8) for seed in range(6)]
+    towns = jax.tree.map(lambda *leaves: jnp.stack(leaves), *layouts)
+    keys = jax.random.split(jax.random.key(0), 6)
+
+    def lives(policy):
+        return jax.jit(jax.vmap(lambda layout, key: rollout(policy, Params(), layout, key).length))(towns, keys)
+
+    assert lives(rollout_planner(oldest_first, samples=2)).mean() > lives(oldest_first).mean()

@@ -25,6 +25,8 @@ seeds = 2
 draws = 5
 validate_every = 200
 validation_draws = 3
+planner_draws = 2
+beam_width = 8
 """
 
 
@@ -52,7 +54,7 @@ def test_tidy_table_has_one_row_per_agent(finished):
     agents = pd.read_csv(directory / "agents.csv")
     assert len(agents) == 8
     assert agents.columns[:3].tolist() == ["seed", "powered", "connected"]
-    for policy in ("best", "last", "stay_put", "random", "round_robin", "oldest_first"):
+    for policy in ("best", "last", "stay_put", "random", "round_robin", "oldest_first", "earliest_deadline"):
         assert agents[f"{policy}_lifetime"].between(5, 40).all()
         assert set(agents[f"{policy}_cause"]) <= {"battery", "data_age", "uav"}
     rich = agents[(agents.powered == 12) & (agents.connected == 12)]
@@ -95,9 +97,15 @@ def test_cells_are_means_over_seeds(finished):
 
 def test_tables_and_figures(finished, tmp_path):
     results, _ = finished
-    assert len(tables.tables(results)) == 4
-    assert "Mean over 4 cells" in tables.summary(results)[0]
-    for figure in (figures.run_figure(results), figures.curves_figure(results)):
+    shown = tables.tables(results)
+    assert len(shown) == 5
+    assert any(
+        "best weights to rollout planner; rollout planner to clairvoyant beam; clair" in title for title in shown
+    )
+    lines = tables.summary(results)
+    assert "Mean over 4 cells" in lines[0]
+    assert "On the planners' draws (2 per layout): best weights" in lines[1]
+    for figure in (figures.run_figure(results), figures.curves_figure(results), figures.ladder_figure(results)):
         figures.save(figure, tmp_path / "figure.png")
         assert (tmp_path / "figure.png").stat().st_size > 10_000
 
@@ -113,6 +121,42 @@ def test_other_axes_make_a_list():
     assert figures.run_figure(results)
 
 
+def test_planners_play_the_same_draws_and_the_bound_holds(finished):
+    results, _ = finished
+    bound = results.evaluation["bound/lifetime"]
+    assert bound.shape == results.evaluation["rollout/lifetime"].shape == (8, 2)
+    for policy in (*results.policies, "rollout", "beam"):
+        lives = results.evaluation[f"{policy}/lifetime"][:, :2]
+        assert (lives <= bound).all(), policy
+        assert_array_equal(results.agents[f"{policy}_planned"], lives.mean(axis=1))
+    assert results.gaps == [("rollout", "best"), ("beam", "rollout"), ("bound", "beam")]
+    cells = results.cells()
+    difference = results.agents["beam_planned"] - results.agents["rollout_planned"]
+    assert cells["beam_over_rollout"].mean() == pytest.approx(difference.mean())
+    assert (cells["rollout_over_best_low"] <= cells["rollout_over_best_high"]).all()
+    for _, cell in cells.iterrows():
+        percent = tables.gap_percent(results, cell)["bound_over_beam"]
+        assert percent == pytest.approx(100 * (cell["bound_planned"] / cell["beam_planned"] - 1))
+    # Stay put with everything powered and connected is the best there is, and the planners find it.
+    rich = results.agents.query("powered == 12 and connected == 12")
+    assert (rich["beam_planned"] >= 33).all()
+
+
+def test_a_study_that_trains_nothing(tmp_path):
+    changes = {"algorithm": "none", "axes.powered": [8], "evaluation.planners": ["bound"], "evaluation.draws": 3}
+    study = parse_study(TOML, "tiny", changes | {"evaluation.baselines": ["oldest-first", "earliest-deadline"]})
+    results = run_study(study, tmp_path / "none")
+    assert results.run["complete"]
+    assert results.policies == ["oldest_first", "earliest_deadline"]
+    assert results.shown == "earliest_deadline"
+    assert results.gaps == [("bound", "earliest_deadline")]
+    again = load_results(tmp_path / "none")
+    assert_array_equal(again.evaluation["bound/lifetime"], results.evaluation["bound/lifetime"])
+    assert len(tables.tables(again)) == 3
+    assert "upper bound" in tables.summary(again)[1]
+    assert figures.run_figure(again)
+
+
 def leave_room_for(agents, study, monkeypatch):
     """Pretend that the host has memory for so many agents in training."""
     plan = plan_study(study)
@@ -123,6 +167,7 @@ def leave_room_for(agents, study, monkeypatch):
 @pytest.mark.slow
 def test_blocks_one_after_the_other_give_every_agent_once(finished, monkeypatch):
     study = finished[0].study
+    study = study.model_copy(update={"evaluation": study.evaluation.model_copy(update={"planners": ()})})
     leave_room_for(2, study, monkeypatch)
     assert plan_study(study).blocks.count == 4
     pieces = run_study(study)
@@ -133,7 +178,7 @@ def test_blocks_one_after_the_other_give_every_agent_once(finished, monkeypatch)
 
 
 def test_interrupted_run_keeps_the_finished_blocks(finished, monkeypatch, tmp_path):
-    study = finished[0].study
+    study = parse_study(TOML, "tiny", {"evaluation.planners": [], "evaluation.baselines": []})
     leave_room_for(4, study, monkeypatch)
     assert plan_study(study).blocks.count == 2
 

@@ -133,7 +133,13 @@ BAD = [
     ({"reward": "U+log(A/0)"}, "bad.toml: reward is 'U+log(A/0)', which is not a reward; did you mean 'U+log(A/O)'?"),
     ({"reward": {"Q": 1.0}}, "bad.toml: reward has the term 'Q', which is not one"),
     ({"guard": "none"}, "bad.toml: guard is 'none'; it should be 'clamp' or 'log1p'"),
-    ({"algorithm": "sarsa"}, "bad.toml: algorithm is 'sarsa'; it should be 'dqn'"),
+    ({"algorithm": "sarsa"}, "bad.toml: algorithm is 'sarsa'; it should be 'dqn' or 'none'"),
+    (
+        {"evaluation.planners": ["oracle"]},
+        "bad.toml: evaluation.planners.0 is 'oracle'; it should be 'rollout', 'beam'",
+    ),
+    ({"evaluation.beam_width": 0}, "bad.toml: evaluation.beam_width is 0; it should be greater than or equal to 1"),
+    ({"evaluation.planner_draws": 0}, "bad.toml: evaluation.planner_draws is 0; it should be greater"),
     ({"name": "../x"}, "bad.toml: name is '../x'"),
 ]
 

@@ -51,13 +51,13 @@ class _Facts:
     duration: np.ndarray
     work: np.ndarray
     upload: np.ndarray
-    counting: np.ndarray
-    base_power: np.ndarray
-    extra_power: np.ndarray
-    to_expiry: np.ndarray
-    unfinished: np.ndarray
-    uav_battery: np.ndarray
-    uav_speed: np.ndarray
+    counting: int
+    base_power: float
+    extra_power: float
+    to_expiry: int
+    unfinished: int
+    uav_battery: float
+    uav_speed: float
 
 
 @jax.jit
@@ -100,14 +100,17 @@ def upper_bounds(
     """:func:`upper_bound` for ``B`` scenarios; every leaf has a leading ``B``."""
     found = {name: np.asarray(leaf) for name, leaf in _facts(params, layouts, volumes).items()}
     found = {name: leaf.astype(float) if leaf.dtype == np.float32 else leaf for name, leaf in found.items()}
-    facts = (_Facts(**{name: leaf[b] for name, leaf in found.items()}) for b in range(len(at_least)))
+    facts = (
+        _Facts(**{name: leaf[b] if leaf.ndim > 1 else leaf[b].item() for name, leaf in found.items()})
+        for b in range(len(at_least))
+    )
     return np.array([_bound(own, int(reached)) for own, reached in zip(facts, at_least, strict=True)], np.int32)
 
 
 def _bound(facts: _Facts, low: int) -> int:
     """The longest life from ``low`` on that is not refuted. A refuted life refutes every longer one."""
-    rounds = Rounds(facts.position, facts.covers, ~facts.has_comms, int(facts.to_expiry))
-    high = int(facts.counting)
+    rounds = Rounds(facts.position, facts.covers, ~facts.has_comms, facts.to_expiry)
+    high = facts.counting
     if low < high and not _possible(facts, rounds, low + 1):
         return low
     low = min(low + 1, high) if low < high else low
@@ -119,7 +122,7 @@ def _bound(facts: _Facts, low: int) -> int:
 
 def _possible(facts: _Facts, rounds: Rounds, life: int) -> bool:
     """Whether the relaxation leaves a lifetime of ``life`` slots open."""
-    survive, paid = life - 1, life - int(facts.unfinished)
+    survive, paid = life - 1, life - facts.unfinished
     slots = max(survive, paid, 1)
     rows, limits = _battery_rows(facts, survive, slots)
     if rows is None:
@@ -188,8 +191,8 @@ def _age_rows(facts: _Facts, survive: int, slots: int) -> np.ndarray:
     """``rows @ x <= -1``: a device without communication is served in every run of slots that expires its data."""
     rows = []
     for device in np.flatnonzero(~facts.has_comms):
-        for start in range(survive - int(facts.to_expiry) + 1):
+        for start in range(survive - facts.to_expiry + 1):
             row = np.zeros((slots, len(facts.capacity)))
-            row[start : start + int(facts.to_expiry)] = -facts.covers[:, device].astype(float)
+            row[start : start + facts.to_expiry] = -facts.covers[:, device].astype(float)
             rows.append(row)
     return np.array(rows).reshape(-1, slots, len(facts.capacity))

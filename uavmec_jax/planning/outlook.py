@@ -11,12 +11,12 @@ from jaxtyping import Array, Int, Key
 
 from uavmec_jax.planning.beam import horizon
 from uavmec_jax.planning.heuristics import HEURISTICS
-from uavmec_jax.planning.lookahead import SAMPLES, rollout_planner
-from uavmec_jax.planning.parallel import bound_all, play_beam, play_rollout
+from uavmec_jax.planning.lookahead import SAMPLES
+from uavmec_jax.planning.parallel import bound_all, play_beam, play_heuristics, play_rollout
 from uavmec_jax.world.layout import Layout
 from uavmec_jax.world.params import Params
 from uavmec_jax.world.physics import Cause
-from uavmec_jax.world.rollout import Episode, Trace, rollouts, tour_policy, trace
+from uavmec_jax.world.rollout import Trace, tour_policy, trace
 
 DRAWS = 8
 WIDTH = 256
@@ -82,26 +82,32 @@ def look_ahead(
         width: of the beam.
         samples: futures that the rollout planner imagines per candidate.
     """
-    count = draws.shape[0]
-    many_params, layouts = _repeat((params, layout), count)
-    slots = horizon(many_params, layouts)
-    played: dict[str, Episode] = {name: _play(params, layout, draws, name) for name in HEURISTICS}
-    played["rollout"] = play_rollout(many_params, layouts, draws, samples=samples)
-    tours, played["beam"] = play_beam(many_params, layouts, draws, slots=slots, width=width)
-    lifetimes = {name: np.asarray(episode.length) for name, episode in played.items()}
-    causes = np.asarray(played["rollout"].cause)
+    count, n = draws.shape[0], layout.capacity.shape[0]
+    # The rollout planner plays the scenario as it is and with every change in one call.
+    changed = [_changed(layout, device, change) for change in CHANGES for device in range(n)]
+    scenarios = jax.tree.map(lambda *leaves: jnp.repeat(jnp.stack(leaves), count, axis=0), layout, *changed)
+    every, many = _repeat(params, len(scenarios.capacity)), _repeat(params, count)
+    layouts = jax.tree.map(lambda leaf: leaf[:count], scenarios)
+    slots = horizon(every, scenarios)
+    tours, ends = play_rollout(every, scenarios, jnp.tile(draws, len(changed) + 1), slots=slots, samples=samples)
+    rollout = jax.tree.map(lambda leaf: np.asarray(leaf[:count]), ends)
+    best_tours, beam = play_beam(many, layouts, draws, slots=slots, width=width)
+    simple = play_heuristics(tuple(HEURISTICS), *_repeat((params, layout), 1), draws[None])
+    lifetimes = {name: np.asarray(simple.length[k, 0]) for k, name in enumerate(HEURISTICS)}
+    lifetimes |= {"rollout": rollout.length, "beam": np.asarray(beam.length)}
+    lives = np.asarray(ends.length).reshape(-1, count)
     return Outlook(
         params=params,
         layout=jax.tree.map(np.asarray, layout),
         lifetimes=lifetimes,
-        bound=bound_all(many_params, layouts, draws, np.max(list(lifetimes.values()), axis=0), slots=slots),
-        first_failure=np.asarray(played["rollout"].first_failure).mean(axis=0),
-        causes={cause: float(np.mean(causes == cause)) for cause in Cause if np.any(causes == cause)},
+        bound=bound_all(many, layouts, draws, np.max(list(lifetimes.values()), axis=0), slots=slots),
+        first_failure=rollout.first_failure.mean(axis=0),
+        causes={cause: float(np.mean(rollout.cause == cause)) for cause in Cause if np.any(rollout.cause == cause)},
         routes={
-            "rollout": _route(_rollout_trace(params, layout, draws[0], slots, samples)),
-            "beam": _route(_tour_trace(params, layout, draws[0], tours[0])),
+            name: _route(_trace(params, layout, draws[0], tour))
+            for name, tour in (("rollout", tours[0]), ("beam", best_tours[0]))
         },
-        what_if=_what_if(params, layout, draws, lifetimes["rollout"], samples),
+        what_if=_what_if(layout, lives[1:].reshape(len(CHANGES), n, count), lives[0]),
     )
 
 
@@ -109,14 +115,9 @@ def _repeat(tree: Any, count: int) -> Any:
     return jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], count, axis=0), tree)
 
 
-_play = jax.jit(lambda params, layout, draws, name: rollouts(HEURISTICS[name], params, layout, draws), static_argnums=3)
-_rollout_trace = jax.jit(
-    lambda params, layout, draw, slots, samples: trace(rollout_planner(samples=samples), params, layout, draw, slots),
-    static_argnums=(3, 4),
-)
-_tour_trace = jax.jit(
-    lambda params, layout, draw, tour: trace(tour_policy(tour), params, layout, draw, tour.shape[0]),
-)
+@jax.jit
+def _trace(params: Params, layout: Layout, draw: Key[Array, ""], tour: Int[Array, " H"]) -> Trace:
+    return trace(tour_policy(tour), params, layout, draw, tour.shape[0])
 
 
 def _route(played: Trace) -> Trace:
@@ -125,21 +126,13 @@ def _route(played: Trace) -> Trace:
     return jax.tree.map(lambda leaf: np.asarray(leaf)[started], played)
 
 
-def _what_if(
-    params: Params, layout: Layout, draws: Key[Array, " D"], now: Int[np.ndarray, " D"], samples: int
-) -> tuple[WhatIf, ...]:
-    """Every change of every device on every draw, in one call."""
-    n, count = layout.capacity.shape[0], draws.shape[0]
-    changed = [_changed(layout, device, change) for change in CHANGES for device in range(n)]
-    layouts = jax.tree.map(lambda *leaves: jnp.repeat(jnp.stack(leaves), count, axis=0), *changed)
-    keys = jnp.tile(draws, len(changed))
-    played = play_rollout(_repeat(params, len(changed) * count), layouts, keys, samples=samples)
-    lives = np.asarray(played.length).reshape(len(CHANGES), n, count)
+def _what_if(layout: Layout, lives: np.ndarray, now: np.ndarray) -> tuple[WhatIf, ...]:
+    """The changes that make sense, ranked; ``lives [3, n, D]`` with them, ``now [D]`` without."""
     lacks = {"repair power": ~np.asarray(layout.has_power), "repair comms": ~np.asarray(layout.has_comms)}
     found = [
         WhatIf(device, change, float(lives[row, device].mean()), float((lives[row, device] - now).mean()))
         for row, change in enumerate(CHANGES)
-        for device in range(n)
+        for device in range(lives.shape[1])
         if change == "remove" or lacks[change][device]
     ]
     return tuple(sorted(found, key=lambda one: (-one.gain, CHANGES.index(one.change), one.device)))

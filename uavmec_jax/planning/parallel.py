@@ -12,10 +12,11 @@ from jaxtyping import Array, Key
 
 from uavmec_jax.planning.beam import beam_search
 from uavmec_jax.planning.bound import upper_bounds
+from uavmec_jax.planning.heuristics import HEURISTICS
 from uavmec_jax.planning.lookahead import rollout_planner
 from uavmec_jax.world.layout import Layout
 from uavmec_jax.world.params import Params
-from uavmec_jax.world.rollout import Episode, Policy, rollout, tour_policy, volume_table
+from uavmec_jax.world.rollout import Episode, recorded, rollout, rollouts, tour_policy, volume_table
 
 _ACCELERATOR_BATCH = 256
 """Scenarios planned for at once on an accelerator. A CPU core takes one at a time and keeps it in its cache."""
@@ -43,13 +44,25 @@ def play_beam(
     return spread(one, params, layouts, keys)
 
 
-@partial(jax.jit, static_argnames=("samples", "base"))
+@partial(jax.jit, static_argnames=("slots", "samples"))
 def play_rollout(
-    params: Params, layouts: Layout, keys: Key[Array, " B"], *, samples: int, base: Policy | None = None
-) -> Episode:
-    """Episodes ``[B]`` of the rollout planner (see :func:`rollout_planner`); otherwise as :func:`play_beam`."""
-    policy = rollout_planner(samples=samples) if base is None else rollout_planner(base, samples)
-    return spread(partial(rollout, policy), params, layouts, keys)
+    params: Params, layouts: Layout, keys: Key[Array, " B"], *, slots: int, samples: int
+) -> tuple[Any, Episode]:
+    """The rollout planner's tour for each scenario, and its episode; see :func:`rollout_planner` and :func:`play_beam`."""
+    return spread(partial(recorded, rollout_planner(samples=samples), slots=slots), params, layouts, keys)
+
+
+@partial(jax.jit, static_argnames="names")
+def play_heuristics(names: tuple[str, ...], params: Params, layouts: Layout, keys: Key[Array, "B D"]) -> Episode:
+    """Episodes ``[K, B, D]`` of ``K`` heuristics: one after the other through one compiled slot."""
+
+    def play(index: Array) -> Episode:
+        def policy(*arguments: Any) -> Array:
+            return jax.lax.switch(index, [HEURISTICS[name] for name in names], *arguments)
+
+        return jax.vmap(partial(rollouts, policy))(params, layouts, keys)
+
+    return jax.lax.map(play, jnp.arange(len(names)))
 
 
 def bound_all(

@@ -53,17 +53,8 @@ def _lifetime_table(outlook: Outlook) -> Table:
 
 def _tour_table(outlook: Outlook, names: Sequence[str], route: Trace) -> Table:
     table = Table()
-    for name in (
-        "slot",
-        "device",
-        "flight, m",
-        "served",
-        "slot length, s",
-        "UAV, kJ left",
-        "lowest battery",
-        "oldest data",
-    ):
-        table.add_column(name, justify="left" if name == "device" else "right")
+    for name in ("slot", "visit", "flight\nm", "served", "length\ns", "UAV\nkJ", "lowest\nbattery", "oldest\ndata"):
+        table.add_column(name, justify="left" if name in ("visit", "served") else "right", no_wrap=name != "served")
     for row in slot_rows(outlook, names, route):
         low, old = row["lowest_battery"], row["oldest_data"]
         table.add_row(

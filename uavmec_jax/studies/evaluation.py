@@ -12,8 +12,7 @@ from jaxtyping import Array, Key
 
 from uavmec_jax.learning.algorithm import Agent, Algorithm
 from uavmec_jax.planning.beam import horizon
-from uavmec_jax.planning.heuristics import HEURISTICS
-from uavmec_jax.planning.parallel import bound_all, play_beam, play_rollout
+from uavmec_jax.planning.parallel import bound_all, play_beam, play_heuristics, play_rollout
 from uavmec_jax.studies.schema import Evaluation
 from uavmec_jax.world.physics import Cause
 from uavmec_jax.world.rollout import Episode, rollouts
@@ -88,7 +87,7 @@ def judge(
     episodes = {name: _play_learned(algorithm, agents, keys, trained) for name, trained in learned}
     names = tuple(baselines)
     if names:
-        played = _play_baselines(names, agents, keys)
+        played = play_heuristics(names, agents.scenario.params, agents.scenario.layout, keys)
         episodes |= {name: jax.tree.map(lambda leaf, k=k: leaf[k], played) for k, name in enumerate(names)}
     return {
         name: Judgement(
@@ -135,7 +134,9 @@ def judge_planners(
     slots = horizon(params, layouts)
     judged = {}
     if "rollout" in settings.planners:
-        judged["rollout"] = _planned(play_rollout(params, layouts, keys, samples=settings.rollout_samples), shape)
+        judged["rollout"] = _planned(
+            play_rollout(params, layouts, keys, slots=slots, samples=settings.rollout_samples)[1], shape
+        )
     if "beam" in settings.planners:
         judged["beam"] = _planned(play_beam(params, layouts, keys, slots=slots, width=settings.beam_width)[1], shape)
     if "bound" in settings.planners:
@@ -182,19 +183,3 @@ def _play_learned(algorithm: Algorithm, agents: Agent, keys: Key[Array, "A D"], 
         return rollouts(policy, agent.scenario.params, agent.scenario.layout, draws)
 
     return jax.vmap(one)(agents, keys, weights)
-
-
-@partial(jax.jit, static_argnames="names")
-def _play_baselines(names: tuple[str, ...], agents: Agent, keys: Key[Array, "A D"]) -> Episode:
-    """Episodes ``[K, A, D]`` of ``K`` heuristics: one after the other through one compiled slot."""
-
-    def play(index: Array) -> Episode:
-        def policy(*arguments: Any) -> Array:
-            return jax.lax.switch(index, [HEURISTICS[name] for name in names], *arguments)
-
-        def one(agent: Agent, draws: Key[Array, " D"]) -> Episode:
-            return rollouts(policy, agent.scenario.params, agent.scenario.layout, draws)
-
-        return jax.vmap(one)(agents, keys)
-
-    return jax.lax.map(play, jnp.arange(len(names)))

@@ -11,7 +11,7 @@ from uavmec_jax.studies.study import held_out_draws, town
 from uavmec_jax.world.inventory import Inventory, inventory_of
 from uavmec_jax.world.inventory_files import load_inventory
 from uavmec_jax.world.params import Params
-from uavmec_jax.world.settings import ParamsSettings, one_line
+from uavmec_jax.world.settings import ParamsSettings, check_ranges, one_line
 
 MOST_DRAWS = 10_000
 
@@ -47,9 +47,13 @@ def load_scenario(
     if source is not None:
         return load_inventory(source, settings), held_out_draws(seed, 0, 0, draws)
     try:
-        params = Params(**ParamsSettings.model_validate(settings).model_dump())
+        checked = ParamsSettings.model_validate(settings)
+        check_ranges(checked, "")
     except pydantic.ValidationError as error:
         raise StudyError(one_line("--set", error, ParamsSettings)) from None
+    except ValueError as error:
+        raise StudyError(f"--set: {error}") from None
+    params = Params(**checked.model_dump())
     for name, count in (("powered", powered), ("connected", connected)):
         if not 0 <= count <= params.n_devices:
             raise StudyError(f"--{name} is {count}; give 0 to {params.n_devices}, the number of devices")

@@ -15,7 +15,7 @@ from uavmec_jax.planning.beam import WIDTH as BEAM_WIDTH
 from uavmec_jax.planning.lookahead import SAMPLES as ROLLOUT_SAMPLES
 from uavmec_jax.world.params import Params
 from uavmec_jax.world.rewards import DEFAULT_REWARD, LOG_GUARDS, REWARDS, TERMS
-from uavmec_jax.world.settings import ParamsSettings, Strict, nearest, settings_model, wanted
+from uavmec_jax.world.settings import ParamsSettings, Strict, check_ranges, nearest, settings_model, wanted
 
 DQNSettings: Any = settings_model("DQNSettings", DQNHyper, DQNSpec, leave_out=("total_steps", "n_devices", "max_age"))
 
@@ -77,10 +77,7 @@ class Study(Strict):
     def _check(self) -> "Study":
         _check_reward("reward", self.reward)
         _check_axes(self)
-        for low_high in ("device_battery_range_j", "task_volume_range_bytes"):
-            low, high = getattr(self.params, low_high)
-            if not 0 < low <= high:
-                raise ValueError(f"params.{low_high} is {[low, high]}; give [low, high] with 0 < low <= high")
+        check_ranges(self.params, "params.")
         return self
 
 

@@ -15,7 +15,7 @@ from uavmec_jax.errors import LayoutError
 from uavmec_jax.world import tables
 from uavmec_jax.world.layout import Layout
 from uavmec_jax.world.params import Params
-from uavmec_jax.world.settings import ParamsSettings, Strict, nearest, wanted
+from uavmec_jax.world.settings import ParamsSettings, Strict, check_ranges, nearest, wanted
 
 MOST_DEVICES = 64
 OWN = -1
@@ -136,6 +136,7 @@ def _first_problem(data: dict[str, Any], error: pydantic.ValidationError) -> str
 
 
 def _build(file: InventoryFile) -> Inventory:
+    check_ranges(file.params, "params.")
     if not 1 <= len(file.device) <= MOST_DEVICES:
         raise ValueError(f"holds {len(file.device)} devices; give 1 to {MOST_DEVICES} [[device]] tables or lines")
     seen: set[str] = set()

@@ -47,14 +47,14 @@ def _from_csv(text: str) -> dict[str, Any]:
     """Cells become numbers and truth values where they can; the checks say what is wrong with the others."""
     words = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
 
-    def cell(column: str, value: str) -> Any:
+    def cell(column: str, value: Any) -> Any:
         if column in ("power", "comms"):
             return words.get(value.lower(), value)
         if column in ("name", "type", "task"):
             return value
         try:
             return float(value)
-        except ValueError:
+        except (ValueError, TypeError):
             return value
 
     rows = csv.DictReader(io.StringIO(text), skipinitialspace=True, restkey="more cells than columns", restval="")

@@ -62,20 +62,36 @@ def rollout(policy: Policy, params: Params, layout: Layout, key: PRNGKeyArray) -
 
 def play_on(policy: Policy, params: Params, layout: Layout, state: State, key: PRNGKeyArray) -> Episode:
     """Play an episode to its end from any state that has not failed; otherwise as :func:`rollout`."""
+    return _play(policy, params, layout, state, key, slots=0)[1]
+
+
+def recorded(
+    policy: Policy, params: Params, layout: Layout, key: PRNGKeyArray, slots: int
+) -> tuple[Int[Array, " slots"], Episode]:
+    """As :func:`rollout`, and the devices visited in the first ``slots`` slots; -1 after the end."""
+    return _play(policy, params, layout, initial_state(params, layout), key, slots)
+
+
+def _play(
+    policy: Policy, params: Params, layout: Layout, state: State, key: PRNGKeyArray, slots: int
+) -> tuple[Array, Episode]:
     n = layout.capacity.shape[0]
     policy_key = jax.random.fold_in(key, _POLICY_STREAM)
 
-    def alive(carry: tuple[State, Outcome]) -> Array:
-        state, outcome = carry
+    def alive(carry: tuple[State, Outcome, Array]) -> Array:
+        state, outcome, _ = carry
         return (outcome.cause == Cause.NONE) & (state.slot < params.max_slots)
 
-    def play_slot(carry: tuple[State, Outcome]) -> tuple[State, Outcome]:
-        state, _ = carry
+    def play_slot(carry: tuple[State, Outcome, Array]) -> tuple[State, Outcome, Array]:
+        state, _, visited = carry
         action = policy(params, layout, state, jax.random.fold_in(policy_key, state.slot))
-        return transition(params, layout, state, action, slot_volumes(params, n, key, state.slot))
+        after, outcome = transition(params, layout, state, action, slot_volumes(params, n, key, state.slot))
+        return after, outcome, visited.at[state.slot].set(action, mode="drop") if slots else visited
 
-    state, outcome = jax.lax.while_loop(alive, play_slot, (state, _nothing(n)))
-    return Episode(length=state.slot, cause=outcome.cause, failed=outcome.failed, first_failure=outcome.first_failure)
+    start = (state, _nothing(n), jnp.full(slots, -1, jnp.int32))
+    state, outcome, visited = jax.lax.while_loop(alive, play_slot, start)
+    ended = Episode(length=state.slot, cause=outcome.cause, failed=outcome.failed, first_failure=outcome.first_failure)
+    return visited, ended
 
 
 def _nothing(n: int) -> Outcome:

@@ -48,6 +48,18 @@ def settings_model(name: str, *declarations: type, leave_out: tuple[str, ...] = 
 ParamsSettings: Any = settings_model("ParamsSettings", Params)
 
 
+def check_ranges(settings: Any, where: str) -> None:
+    """Refuse ranges that are none; ``where`` stands before the name in the message.
+
+    Raises:
+        ValueError: one line.
+    """
+    for name in ("device_battery_range_j", "task_volume_range_bytes"):
+        low, high = getattr(settings, name)
+        if not 0 < low <= high:
+            raise ValueError(f"{where}{name} is {[low, high]}; give [low, high] with 0 < low <= high")
+
+
 def nearest(word: str, words: Any) -> str:
     """A hint: the nearest of the known words, or all of them."""
     close = difflib.get_close_matches(word, list(words), n=1, cutoff=0.4)

@@ -1,0 +1,99 @@
+"""The clairvoyant beam: its tours are real, its pruning is sound, it finds shared hover points."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.planning.instances import SLOTS, traced
+from uavmec_jax.planning import demand
+from uavmec_jax.planning.beam import _dominated, beam_search
+from uavmec_jax.studies.study import town
+from uavmec_jax.world.params import Params
+from uavmec_jax.world.physics import initial_state
+from uavmec_jax.world.rollout import rollout, tour_policy, volume_table
+
+search = jax.jit(beam_search, static_argnums=3)
+PARAMS = traced(Params())
+
+
+def pair_town():
+    """Nobody has power or communication; devices 0 and 1 can be served together."""
+    layout = town(0, PARAMS, 0, 0)
+    position = jnp.stack([200.0 * (jnp.arange(12) % 4), 300.0 * (jnp.arange(12) // 4)], axis=1)
+    return layout.replace(position=position.at[1].set(position[0] + 40.0), capacity=jnp.full(12, 79_000.0))
+
+
+@pytest.mark.parametrize(("powered", "connected", "seed"), [(8, 8, 3), (4, 4, 14)])
+def test_the_tour_lives_as_long_as_it_says(powered, connected, seed):
+    layout, key = town(seed, PARAMS, powered, connected), jax.random.key(seed)
+    tour = search(PARAMS, layout, volume_table(PARAMS, 12, key, SLOTS), 64)
+    episode = rollout(tour_policy(tour.actions), PARAMS, layout, key)
+    assert episode.length == tour.lifetime <= tour.aim
+    visits = np.asarray(tour.actions)
+    assert (visits[: int(tour.lifetime)] >= 0).all()
+    assert (visits[int(tour.lifetime) :] == -1).all()
+
+
+def test_a_shared_hover_point_lives_longer_than_eleven():
+    layout = pair_town()
+    tour = search(PARAMS, layout, volume_table(PARAMS, 12, jax.random.key(0), SLOTS), 64)
+    assert tour.lifetime > 11
+
+
+def test_aim_is_lowered_from_a_bound_that_is_known():
+    layout = town(3, PARAMS, 8, 8)
+    volumes = volume_table(PARAMS, 12, jax.random.key(0), SLOTS)
+    free, held = (jax.jit(lambda most: beam_search(PARAMS, layout, volumes, 16, most))(most) for most in (99, 15))
+    assert held.aim == 15
+    assert held.lifetime == 15 < free.lifetime
+
+
+def test_dominance():
+    layout = town(0, PARAMS, 0, 0)
+    start = initial_state(PARAMS, layout)
+    states = jax.tree.map(lambda leaf: jnp.stack([leaf] * 5), start)
+    states = states.replace(
+        age=states.age.at[1, 0].set(1),  # older data than 0
+        battery=states.battery.at[2, 3].add(-1.0),  # less battery than 0
+        uav_energy=states.uav_energy.at[3].add(1.0),  # more energy than 0, but elsewhere
+    )
+    place, alive = jnp.array([5, 5, 5, 6, 5]), jnp.ones(5, bool)
+    assert _dominated(layout, states, place, alive).tolist() == [False, True, True, False, True]  # 4 is 0 again
+    assert _dominated(layout, states, place, alive.at[0].set(False)).tolist() == [True, True, True, False, False]
+    blind = layout.replace(has_comms=jnp.ones(12, bool), has_power=jnp.ones(12, bool))
+    assert _dominated(blind, states, place, alive).tolist() == [False, True, True, False, True]
+
+
+def test_shares_never_charge_a_hover_point_more_than_one_visit():
+    for seed in range(20):
+        params = Params(region_m=(150.0, 150.0))
+        layout = town(seed, params, 6, 6)
+        covers = demand.coverage(params, layout)
+        charged = demand.shares(layout, covers)
+        assert (covers @ charged).max() <= 1 + 1e-6
+        needy = ~(layout.has_power & layout.has_comms)
+        assert ((charged > 0) == needy).all()
+
+
+def test_battery_visits_skip_the_largest_savings_first():
+    layout = town(0, PARAMS, 11, 12)
+    costs = demand.slot_costs(PARAMS, layout, volume_table(PARAMS, 12, jax.random.key(0), SLOTS))
+    device = int(np.flatnonzero(~layout.has_power)[0])
+    need = demand.battery_demand(layout, costs, 0, 20)
+    saving = np.sort(np.asarray(costs.work - costs.upload)[:20, device])[::-1]
+    np.testing.assert_allclose(need.saved[:4, device], np.concatenate([[0.0], np.cumsum(saving[:3])]), rtol=1e-5)
+    battery = jnp.full(12, need.drain[device] - saving[:2].sum() + 1.0)
+    whole, part, hopeless = demand.battery_visits(layout, need, battery)
+    assert whole[device] == 2
+    assert 1 < part[device] <= 2
+    assert whole.sum() == 2  # powered devices need none
+    assert not hopeless.any()
+    assert demand.battery_visits(layout, need, jnp.zeros(12))[2][device]
+
+
+def test_mean_slot_is_the_mean_of_many():
+    layout = town(1, PARAMS, 0, 0)
+    many = demand.slot_costs(PARAMS, layout, volume_table(PARAMS, 12, jax.random.key(0), 20_000))
+    mean = demand.mean_slot(PARAMS, layout)
+    np.testing.assert_allclose(mean.work, many.work.mean(axis=0), rtol=0.01)

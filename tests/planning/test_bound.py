@@ -1,0 +1,110 @@
+"""Attempts to break the certificate."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from tests.planning.instances import SLOTS, small_instance, traced
+from tests.worlds import three_devices
+from uavmec_jax.planning.beam import beam_search, horizon
+from uavmec_jax.planning.bound import _refuted, upper_bound
+from uavmec_jax.planning.exact import exact_tour
+from uavmec_jax.planning.flight import Rounds
+from uavmec_jax.planning.heuristics import HEURISTICS
+from uavmec_jax.planning.lookahead import rollout_planner
+from uavmec_jax.studies.study import town
+from uavmec_jax.world.params import Params
+from uavmec_jax.world.rollout import rollout, volume_table
+
+search = jax.jit(beam_search, static_argnums=3)
+
+
+@functools.cache
+def play(name):
+    policy = rollout_planner(samples=1) if name == "rollout" else HEURISTICS[name]
+    return jax.jit(functools.partial(rollout, policy))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("block", range(4))
+def test_nothing_passes_the_bound_on_small_instances(block):
+    """No policy, no beam of any width and not the optimum; and a wide beam is the optimum."""
+    for number in range(10 * block, 10 * block + 10):
+        params, layout, key, volumes = small_instance(number)
+        params = traced(params)
+        optimum = int(exact_tour(params, layout, np.asarray(volumes)).lifetime)
+        assert optimum <= upper_bound(params, layout, volumes), number
+        beams = [int(search(params, layout, volumes, width).lifetime) for width in (1, 8, 512)]
+        assert max(beams) <= optimum, number
+        assert beams[-1] == optimum, number
+        if optimum < SLOTS:
+            lives = {name: int(play(name)(params, layout, key).length) for name in (*HEURISTICS, "rollout")}
+            assert max(lives.values()) <= optimum, (number, lives)
+
+
+@pytest.mark.parametrize("number", [0, 2, 12])
+def test_optimum_beam_and_bound_on_a_small_instance(number):
+    params, layout, _, volumes = small_instance(number)
+    params = traced(params)
+    optimum = int(exact_tour(params, layout, np.asarray(volumes)).lifetime)
+    assert int(search(params, layout, volumes, 512).lifetime) == optimum <= upper_bound(params, layout, volumes)
+
+
+@pytest.mark.parametrize(("powered", "connected"), [(12, 12), (12, 4), (8, 8), (4, 4), (0, 0)])
+def test_nobody_passes_the_bound_at_the_papers_settings(powered, connected):
+    params = traced(Params())
+    for seed in range(4):
+        layout, key = town(seed, params, powered, connected), jax.random.key(seed)
+        volumes = volume_table(params, 12, key, SLOTS)
+        bound = upper_bound(params, layout, volumes)
+        lives = {name: int(play(name)(params, layout, key).length) for name in ("earliest-deadline", "oldest-first")}
+        lives |= {f"beam {width}": int(search(params, layout, volumes, width).lifetime) for width in (4, 64)}
+        assert max(lives.values()) <= bound, lives
+        assert bound - lives["beam 64"] <= 2
+        # Started from a lifetime that was reached, the search ends at the same place.
+        assert upper_bound(params, layout, volumes, at_least=lives["beam 64"]) == bound
+
+
+def test_what_is_known_in_closed_form():
+    params = traced(Params())
+    everything = town(0, params, 12, 12)
+    volumes = volume_table(params, 12, jax.random.key(0), SLOTS)
+    assert upper_bound(params, everything, volumes) == int(search(params, everything, volumes, 16).lifetime) >= 33
+    far = jnp.stack([200.0 * jnp.arange(12) % 800, 250.0 * (jnp.arange(12) // 4)], axis=1)
+    nothing = town(0, params, 0, 0).replace(position=far)
+    assert upper_bound(params, nothing, volumes) == 11
+    assert int(search(params, nothing, volumes, 16).lifetime) == 11
+
+
+def test_horizon_is_never_passed():
+    params = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], Params(n_devices=3))
+    layout = three_devices(has_power=(True,) * 3, has_comms=(True,) * 3, processing_rate=jnp.full(3, 4e4))
+    slots = horizon(params, jax.tree.map(lambda leaf: leaf[None], layout))
+    life = int(rollout(HEURISTICS["stay-put"], Params(n_devices=3), layout, jax.random.key(0)).length)
+    assert 64 < life <= slots == 512
+
+
+def test_refutation_needs_multipliers_that_prove_it():
+    # Two slots, two hover points; device 0 wants both slots at the first, device 1 one at the second.
+    wants = np.zeros((2, 2, 2))
+    wants[0, :, 0] = -1.0
+    wants[1, :, 1] = -1.0
+    assert _refuted(wants, np.array([-2.0, -1.0]))
+    assert not _refuted(wants, np.array([-1.0, -1.0]))
+
+
+def test_rounds_are_the_shortest_paths():
+    position = np.array([[100.0, 0.0], [200.0, 0.0], [300.0, 0.0], [900.0, 900.0]])
+    rounds = Rounds(position, np.eye(4, dtype=bool), np.array([True, True, True, False]), 11)
+    assert_allclose(rounds.least_flight(10), 100.0)  # nothing falls due: the nearest device
+    assert_allclose(rounds.least_flight(11), 300.0)
+    assert_allclose(rounds.least_flight(21), 500.0)  # and back
+    assert_allclose(rounds.least_flight(31), 700.0)
+    covers = np.eye(4, dtype=bool)
+    covers[1, :3] = True  # everyone is served from the middle
+    shared = Rounds(position, covers, np.array([True, True, True, False]), 11)
+    assert_allclose(shared.least_flight(31), 200.0)
