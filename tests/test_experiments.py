@@ -39,3 +39,12 @@ def test_benchmark_dqn(tmp_path):
     assert [row["agents"] for row in report["training"]] == [1, 8, 75, 300]
     assert all(row["steps_per_second"] > 0 for row in report["training"])
     assert report["ceiling"] > 0
+
+
+def test_benchmark_planning(tmp_path):
+    out = run("benchmark_planning.py", "--layouts", 3, "--widths", 8, "--out", tmp_path)
+    assert "beam 8" in out
+    rows = json.loads((tmp_path / "benchmark_planning.json").read_text())["rows"]
+    assert len(rows) == 4 * 3
+    means = {(row["powered"], row["planner"]): row["mean"] for row in rows}
+    assert all(means[powered, "beam 8"] <= means[powered, "bound"] for powered in (12, 10, 8, 4))

@@ -4,7 +4,12 @@ from .learning.algorithm import Agent as Agent
 from .learning.algorithm import Algorithm as Algorithm
 from .learning.dqn import DQNHyper as DQNHyper
 from .learning.dqn import DQNSpec as DQNSpec
+from .planning.beam import beam_search as beam_search
+from .planning.bound import upper_bound as upper_bound
 from .planning.heuristics import HEURISTICS as HEURISTICS
+from .planning.lookahead import rollout_planner as rollout_planner
+from .planning.outlook import Outlook as Outlook
+from .planning.outlook import look_ahead as look_ahead
 from .studies.results import Results as Results
 from .studies.results import load_results as load_results
 from .studies.run import run_study as run_study
@@ -15,6 +20,8 @@ from .world.environment import UavMecEnv as UavMecEnv
 from .world.environment import advance as advance
 from .world.environment import make_scenario as make_scenario
 from .world.environment import observe as observe
+from .world.inventory import Inventory as Inventory
+from .world.inventory_files import load_inventory as load_inventory
 from .world.layout import Layout as Layout
 from .world.layout import make_layout as make_layout
 from .world.layout import sample_layout as sample_layout
@@ -31,3 +38,4 @@ from .world.rewards import make_reward as make_reward
 from .world.rollout import Episode as Episode
 from .world.rollout import rollout as rollout
 from .world.rollout import rollouts as rollouts
+from .world.rollout import volume_table as volume_table

@@ -22,7 +22,6 @@ from uavmec_jax.world.physics import State, slots_to_expiry
 LOOKAHEAD = 64
 """Slots that the rule looks ahead at most; at the paper's settings the UAV's battery lasts 33."""
 
-_NEVER = 1e6
 _TIE_PER_M = 1e-6
 """Equal deadlines go to the nearest device."""
 
@@ -51,17 +50,16 @@ def earliest_deadline(params: Params, layout: Layout, state: State, key: PRNGKey
 
 
 def _due(params: Params, layout: Layout, state: State, covers: Bool[Array, "n n"], slots: Any) -> Float[Array, " n"]:
-    """Slots until each hover point must be visited; ``_NEVER`` where nothing falls due within ``slots`` slots.
+    """Slots until each hover point must be visited; :data:`demand.NEVER` where nothing falls due within ``slots`` slots.
 
     Every device without communication is fetched from the hover point that serves most of them, so devices that can
     share a visit always do, and share their deadline.
     """
     calls = ~layout.has_comms
-    together = jnp.sum(covers & calls, axis=1)
-    hover = jnp.argmax(jnp.where(covers, together[:, None], -1), axis=0)
+    hover = demand.fetched_from(covers, calls)
     left = (slots_to_expiry(params) - state.age).astype(jnp.float32)
-    left = jnp.where(calls & (left <= slots), left, _NEVER)
-    return jnp.min(jnp.where(hover == jnp.arange(hover.shape[0])[:, None], left, _NEVER), axis=1)
+    left = jnp.where(calls & (left <= slots), left, demand.NEVER)
+    return jnp.min(jnp.where(hover == jnp.arange(hover.shape[0])[:, None], left, demand.NEVER), axis=1)
 
 
 def _hoped_for(
@@ -94,4 +92,4 @@ def _hoped_for(
 def _can_wait(due: Float[Array, " n"]) -> Bool[Array, ""]:
     """Whether a slot may be spent on something else: all data can then still be fetched before they expire."""
     load = jnp.sum(due <= due[:, None], axis=-1)
-    return jnp.all((due == _NEVER) | (load + 1.0 <= due))
+    return jnp.all((due == demand.NEVER) | (load + 1.0 <= due))

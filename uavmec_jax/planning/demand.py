@@ -18,6 +18,9 @@ from uavmec_jax.world.physics import slots_to_expiry, upload_rate
 _ROUNDING = 1e-5
 """Relative allowance for single precision, always given in favour of the network."""
 
+NEVER = 1_000_000
+"""Slots until something falls due that never does."""
+
 
 @struct.dataclass
 class SlotCosts:
@@ -55,6 +58,12 @@ def shares(layout: Layout, covers: Bool[Array, "n n"]) -> Float[Array, " n"]:
     together = jnp.sum(covers & needy, axis=1)
     most = jnp.max(jnp.where(covers, together[:, None], 1), axis=0)
     return jnp.where(needy, 1.0 / most, 0.0)
+
+
+def fetched_from(covers: Bool[Array, "n n"], these: Bool[Array, " n"]) -> Int[Array, " n"]:
+    """The hover point from which each device is best served: the one that serves most of ``these``."""
+    together = jnp.sum(covers & these, axis=1)
+    return jnp.argmax(jnp.where(covers, together[:, None], -1), axis=0)
 
 
 def slot_costs(params: Params, layout: Layout, volumes: Num[Array, "H n"]) -> SlotCosts:
@@ -154,9 +163,24 @@ def overdue(
     """
     due = slots_to_expiry(params) - age
     matters = ~layout.has_comms & (due <= slots)
-    before = matters[..., None, :] & (due[..., None, :] <= due[..., :, None])
-    load = jnp.sum(jnp.where(before, charged, 0.0), axis=-1)
+    load = load_by_due(jnp.where(matters, due, jnp.iinfo(jnp.int32).max), charged)
     return jnp.any(matters & (load > due + _ROUNDING * 10), axis=-1)
+
+
+def load_by_due(due: Int[Array, "*B n"], charged: Float[Array, " n"]) -> Float[Array, "*B n"]:
+    """Charged visits that fall due no later than each entry's own due date."""
+    # Entries in rows and one against all at a time: the batch stays the innermost axis, which is what a CPU is fast at.
+    rows = jnp.moveaxis(due, -1, 0)
+    add = lambda entry, load: load + jnp.where(rows[entry] <= rows, charged[entry], 0.0)  # noqa: E731
+    return jnp.moveaxis(jax.lax.fori_loop(0, rows.shape[0], add, jnp.zeros(rows.shape)), 0, -1)
+
+
+def most_by_place(place: Int[Array, " n"], value: Num[Array, "*B n"]) -> Num[Array, "*B n"]:
+    """The largest value of the devices that belong to each place; minus :data:`NEVER` where none does."""
+    rows = jnp.moveaxis(value, -1, 0)
+    lowest = jnp.full(rows.shape, -NEVER, rows.dtype)
+    most = lambda device, found: found.at[place[device]].max(rows[device])  # noqa: E731
+    return jnp.moveaxis(jax.lax.fori_loop(0, rows.shape[0], most, lowest), 0, -1)
 
 
 def flight_power(params: Params) -> tuple[Any, Any]:

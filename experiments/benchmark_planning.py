@@ -1,0 +1,83 @@
+"""Planning speed and what the beam's width buys: 100 layouts per cell, compilation included where it says so.
+
+    uv run python experiments/benchmark_planning.py [--layouts 100] [--widths 16 64 256] [--out results/planning]
+
+Writes `benchmark_planning.json` and prints the same as a table.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from uavmec_jax.studies import host
+
+host.use_every_core()
+
+import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+
+from uavmec_jax.planning.beam import horizon  # noqa: E402
+from uavmec_jax.planning.lookahead import SAMPLES  # noqa: E402
+from uavmec_jax.planning.parallel import bound_all, play_beam, play_rollout  # noqa: E402
+from uavmec_jax.studies.study import held_out_draws, town  # noqa: E402
+from uavmec_jax.world.params import Params  # noqa: E402
+
+CELLS = [(12, 4), (10, 10), (8, 8), (4, 4)]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--layouts", type=int, default=100)
+    parser.add_argument("--widths", type=int, nargs="+", default=[256, 64, 16])
+    parser.add_argument("--out", type=Path, default=Path("results/planning"))
+    arguments = parser.parse_args()
+
+    rows = [row for cell in CELLS for row in benchmark(*cell, arguments.layouts, arguments.widths)]
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    report = {"command": "uv run python experiments/benchmark_planning.py", "rows": rows, **host.describe()}
+    (arguments.out / "benchmark_planning.json").write_text(json.dumps(report, indent=1) + "\n")
+    print(f"{'powered':>8}{'connected':>10}  {'planner':<10}{'mean slots':>11}{'s, compiled':>13}{'s, first':>10}")
+    for row in rows:
+        print(
+            f"{row['powered']:>8}{row['connected']:>10}  {row['planner']:<10}{row['mean']:>11.2f}"
+            f"{row['seconds_compiled']:>13.1f}{row['seconds_first']:>10.1f}"
+        )
+
+
+def benchmark(powered: int, connected: int, count: int, widths: list[int]) -> list[dict[str, Any]]:
+    """One row per planner: mean lifetime, seconds of the first call (with compilation) and of the second."""
+    params = jax.tree.map(lambda leaf: jnp.full(count, leaf), Params())
+    layouts = jax.vmap(lambda seed: town(seed, Params(), powered, connected))(jnp.arange(count))
+    keys = jnp.concatenate([held_out_draws(seed, powered, connected, 1) for seed in range(count)])
+    scenarios = (params, layouts, keys)
+    slots = horizon(params, layouts)
+    rows, reached = [], np.ones(count)
+
+    def measure(planner: str, play: Callable, *arguments: Any, **options: Any) -> np.ndarray:
+        jax.clear_caches()  # the first time is what a fresh process needs
+        found, first = timed(play, *arguments, **options)
+        _, again = timed(play, *arguments, **options)
+        lives = np.asarray(found[1].length if isinstance(found, tuple) else found)
+        cell = {"powered": powered, "connected": connected, "layouts": count, "planner": planner}
+        rows.append(cell | {"mean": float(lives.mean()), "seconds_first": first, "seconds_compiled": again})
+        return lives
+
+    for width in widths:
+        reached = np.maximum(reached, measure(f"beam {width}", play_beam, *scenarios, slots=slots, width=width))
+    measure("rollout", play_rollout, *scenarios, slots=slots, samples=SAMPLES)
+    measure("bound", bound_all, *scenarios, reached, slots=slots)
+    return rows
+
+
+def timed(function: Callable, *arguments: Any, **options: Any) -> tuple[Any, float]:
+    tick = time.perf_counter()
+    result = jax.block_until_ready(function(*arguments, **options))
+    return result, time.perf_counter() - tick
+
+
+if __name__ == "__main__":
+    main()
