@@ -1,6 +1,14 @@
 """Every test runs with shapes and types checked at run time, and with two CPU devices."""
 
+import os
 import tempfile
+
+# The same program is compiled once in a session, whichever worker, test or subprocess asks for it: the first process
+# makes the folder, the others inherit its name.
+if "PYTEST_XDIST_WORKER" not in os.environ:
+    _cache = tempfile.TemporaryDirectory(prefix="uavmec-jax-tests-")
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache.name
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
 
 import jax
 from jaxtyping import install_import_hook
@@ -8,10 +16,5 @@ from jaxtyping import install_import_hook
 import tests.typechecking  # noqa: F401  (the hook below finds it by name)
 
 jax.config.update("jax_num_cpu_devices", 2)
-
-# The same program is compiled once in a session, whichever test asks for it.
-_cache = tempfile.TemporaryDirectory(prefix="uavmec-jax-tests-")
-jax.config.update("jax_compilation_cache_dir", _cache.name)
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
 
 install_import_hook("uavmec_jax", "tests.typechecking.checked")

@@ -21,6 +21,8 @@ connected = [8]
 seeds = 2
 [evaluation]
 draws = 4
+planners = []
+baselines = ["stay-put", "oldest-first"]
 """
 
 
@@ -49,7 +51,7 @@ def test_help_does_not_import_jax():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert "run table5 --quick" in done.stdout
     assert done.stdout.strip().endswith("False")
-    for command in ("run", "show", "validate", "doctor"):
+    for command in ("run", "plan", "show", "validate", "doctor"):
         assert "Usage" in CliRunner().invoke(main, [command, "--help"]).stdout
 
 
@@ -92,11 +94,15 @@ def test_resolved_study_runs_again(run_directory, tmp_path):
     assert again["cells"] == first["cells"]
 
 
-def test_validate_and_doctor(run_directory, tmp_path):
+def test_validate():
     assert (
         "table5: a valid study: 250 agents x 1,000,000 steps" in CliRunner().invoke(main, ["validate", "table5"]).stdout
     )
     assert json.loads(CliRunner().invoke(main, ["validate", "table5", "--json"]).stdout)["steps"] == 1_000_000
+
+
+@pytest.mark.slow
+def test_doctor():
     facts = json.loads(uavmec("doctor", "--json").stdout)
     assert facts["environment_steps_per_second"] > 10_000
     assert facts["devices"]

@@ -60,13 +60,14 @@ def test_dominance():
     )
     place, alive = jnp.array([5, 5, 5, 6, 5]), jnp.ones(5, bool)
     assert _dominated(layout, states, place, alive).tolist() == [False, True, True, False, True]  # 4 is 0 again
-    assert _dominated(layout, states, place, alive.at[0].set(False)).tolist() == [True, True, True, False, False]
+    without_0 = _dominated(layout, states, place, alive.at[0].set(False))
+    assert without_0[1:].tolist() == [True, True, False, False]  # 4 takes its place
     blind = layout.replace(has_comms=jnp.ones(12, bool), has_power=jnp.ones(12, bool))
     assert _dominated(blind, states, place, alive).tolist() == [False, True, True, False, True]
 
 
 def test_shares_never_charge_a_hover_point_more_than_one_visit():
-    for seed in range(20):
+    for seed in range(8):
         params = Params(region_m=(150.0, 150.0))
         layout = town(seed, params, 6, 6)
         covers = demand.coverage(params, layout)
@@ -78,22 +79,24 @@ def test_shares_never_charge_a_hover_point_more_than_one_visit():
 
 def test_battery_visits_skip_the_largest_savings_first():
     layout = town(0, PARAMS, 11, 12)
-    costs = demand.slot_costs(PARAMS, layout, volume_table(PARAMS, 12, jax.random.key(0), SLOTS))
+    volumes = volume_table(PARAMS, 12, jax.random.key(0), SLOTS)
+    costs = jax.jit(demand.slot_costs)(PARAMS, layout, volumes)
     device = int(np.flatnonzero(~layout.has_power)[0])
-    need = demand.battery_demand(layout, costs, 0, 20)
+    need = jax.jit(demand.battery_demand)(layout, costs, 0, 20)
     saving = np.sort(np.asarray(costs.work - costs.upload)[:20, device])[::-1]
     np.testing.assert_allclose(need.saved[:4, device], np.concatenate([[0.0], np.cumsum(saving[:3])]), rtol=1e-5)
     battery = jnp.full(12, need.drain[device] - saving[:2].sum() + 1.0)
-    whole, part, hopeless = demand.battery_visits(layout, need, battery)
+    visits = jax.jit(demand.battery_visits)
+    whole, part, hopeless = visits(layout, need, battery)
     assert whole[device] == 2
     assert 1 < part[device] <= 2
     assert whole.sum() == 2  # powered devices need none
     assert not hopeless.any()
-    assert demand.battery_visits(layout, need, jnp.zeros(12))[2][device]
+    assert visits(layout, need, jnp.zeros(12))[2][device]
 
 
 def test_mean_slot_is_the_mean_of_many():
     layout = town(1, PARAMS, 0, 0)
-    many = demand.slot_costs(PARAMS, layout, volume_table(PARAMS, 12, jax.random.key(0), 20_000))
-    mean = demand.mean_slot(PARAMS, layout)
+    many = jax.jit(demand.slot_costs)(PARAMS, layout, volume_table(PARAMS, 12, jax.random.key(0), 20_000))
+    mean = jax.jit(demand.mean_slot)(PARAMS, layout)
     np.testing.assert_allclose(mean.work, many.work.mean(axis=0), rtol=0.01)

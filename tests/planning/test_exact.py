@@ -11,6 +11,8 @@ from tests.planning.instances import SLOTS, small_instance, traced
 from uavmec_jax.planning.exact import exact_tour
 from uavmec_jax.world.rollout import rollout, tour_policy
 
+pytestmark = pytest.mark.slow
+
 LENGTH = 7
 
 
@@ -22,7 +24,7 @@ def every_life(params, layout, key):
     return np.asarray(play(jnp.asarray(tours)))
 
 
-@pytest.mark.parametrize("number", [0, 12, 15, 22, 32])
+@pytest.mark.parametrize("number", [12, 15, 22])
 def test_exact_is_the_best_of_every_tour(number):
     params, layout, key, volumes = small_instance(number, devices=3)
     params = params.replace(max_slots=LENGTH)  # no life is longer than the tours enumerated

@@ -70,10 +70,11 @@ def test_lowest_battery_goes_by_fraction():
 
 def test_shortest_life_holds_batteries_against_ages():
     # With 600 s slots at most: device 2 uses (4 + 2.5) W and its 60 kJ last longest of what is left; ages have 11 slots.
-    assert shortest_life(PARAMS, LAYOUT, START.replace(age=jnp.array([3, 8, 2]))) == 1
+    shortest = jax.jit(shortest_life)
+    assert shortest(PARAMS, LAYOUT, START.replace(age=jnp.array([3, 8, 2]))) == 1
     low = START.replace(battery=jnp.array([60_000.0, 60_000.0, 3_000.0]))
-    assert shortest_life(PARAMS, LAYOUT, low) == 2
-    assert shortest_life(PARAMS, LAYOUT.replace(has_power=jnp.array([True, True, True])), low) == 0
+    assert shortest(PARAMS, LAYOUT, low) == 2
+    assert shortest(PARAMS, LAYOUT.replace(has_power=jnp.array([True, True, True])), low) == 0
 
 
 def test_earliest_deadline_fetches_data_just_in_time_and_serves_batteries_meanwhile():
@@ -91,7 +92,7 @@ def test_earliest_deadline_fetches_data_just_in_time_and_serves_batteries_meanwh
 def test_earliest_deadline_rests_where_nothing_is_asked_for():
     layout = town(0, Params(), 12, 12)
     state = initial_state(Params(), layout).replace(uav_position=layout.position[7])
-    assert earliest_deadline(Params(), layout, state) == 7
+    assert jax.jit(earliest_deadline)(Params(), layout, state) == 7
 
 
 def test_devices_that_share_a_hover_point_share_a_visit():
@@ -99,13 +100,14 @@ def test_devices_that_share_a_hover_point_share_a_visit():
     chain = jnp.array([[100.0, 100.0], [150.0, 100.0], [200.0, 100.0]])
     layout = three_devices(has_power=(True, True, True), position=chain)
     state = START.replace(age=jnp.array([10, 10, 10]))
-    assert earliest_deadline(PARAMS, layout, state) == 1
+    assert jax.jit(earliest_deadline)(PARAMS, layout, state) == 1
 
 
 def test_shortest_tour_is_a_tour_through_the_needy():
     layout = town(5, Params(), 6, 6)
     needy = np.flatnonzero(~np.asarray(layout.has_power & layout.has_comms))
-    order = [int(shortest_tour(Params(), layout, START_12.replace(slot=jnp.int32(slot)))) for slot in range(len(needy))]
+    policy = jax.jit(shortest_tour)
+    order = [int(policy(Params(), layout, START_12.replace(slot=jnp.int32(slot)))) for slot in range(len(needy))]
     assert sorted(order) == needy.tolist()
     position = np.asarray(layout.position)
     best = min(length(position[[needy[0], *rest]]) for rest in itertools.permutations(needy[1:]) if len(needy) <= 9)
@@ -118,7 +120,7 @@ def length(stops):
 
 def test_two_opt_uncrosses():
     square = jnp.array([[0.0, 0.0], [1.0, 1.0], [1.0, 0.0], [0.0, 1.0], [9.0, 9.0]])
-    tour = two_opt(square, jnp.arange(5), jnp.int32(4))
+    tour = jax.jit(two_opt)(square, jnp.arange(5), jnp.int32(4))
     assert length(np.asarray(square)[np.asarray(tour)[:4]]) == pytest.approx(4.0)
     assert tour[4] == 4
 
@@ -133,6 +135,7 @@ def test_rollout_planner_knows_no_volumes_and_needs_a_key():
     assert first(jax.random.key(1)) == first(jax.random.key(1))
 
 
+@pytest.mark.slow
 def test_rollout_planner_improves_on_its_base():
     layouts = [town(seed, Params(), 8, 8) for seed in range(6)]
     towns = jax.tree.map(lambda *leaves: jnp.stack(leaves), *layouts)

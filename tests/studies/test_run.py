@@ -27,6 +27,7 @@ validate_every = 200
 validation_draws = 3
 planner_draws = 2
 beam_width = 8
+baselines = ["stay-put", "random", "round-robin", "oldest-first", "earliest-deadline"]
 """
 
 
@@ -150,6 +151,12 @@ def test_a_study_that_trains_nothing(tmp_path):
     assert results.policies == ["oldest_first", "earliest_deadline"]
     assert results.shown == "earliest_deadline"
     assert results.gaps == [("bound", "earliest_deadline")]
+    assert {file.name for file in (tmp_path / "none").iterdir()} == {
+        "study.toml",
+        "run.json",
+        "agents.csv",
+        "evaluation.npz",
+    }
     again = load_results(tmp_path / "none")
     assert_array_equal(again.evaluation["bound/lifetime"], results.evaluation["bound/lifetime"])
     assert len(tables.tables(again)) == 3
@@ -177,6 +184,7 @@ def test_blocks_one_after_the_other_give_every_agent_once(finished, monkeypatch)
     assert pieces.curves["validation"].shape == (8, 3)
 
 
+@pytest.mark.slow
 def test_interrupted_run_keeps_the_finished_blocks(finished, monkeypatch, tmp_path):
     study = parse_study(TOML, "tiny", {"evaluation.planners": [], "evaluation.baselines": []})
     leave_room_for(4, study, monkeypatch)

@@ -119,7 +119,8 @@ class Results:
             directory / _AGENTS, lambda file: file.write(self.agents.to_csv(index=False, float_format="%.6g").encode())
         )
         for name, arrays in ((_CURVES, self.curves), (_EVALUATION, self.evaluation), (_WEIGHTS, self.weights)):
-            write_file(directory / name, partial(_save_arrays, arrays=arrays))
+            if arrays:  # nothing was trained: no curves, no weights
+                write_file(directory / name, partial(_save_arrays, arrays=arrays))
         write_file(directory / _RUN, lambda file: file.write((json.dumps(self.run, indent=1) + "\n").encode()))
 
 
@@ -163,11 +164,12 @@ def load_results(directory: str | Path) -> Results:
         raise StudyError(f"{directory}: cannot be read: {error}") from None
     if run.get("schema", SCHEMA) > SCHEMA:
         raise StudyError(f"{directory / _RUN}: schema is {run['schema']}; this version reads up to {SCHEMA}")
+    study = load_study(directory / _STUDY)
     return Results(
-        study=load_study(directory / _STUDY),
+        study=study,
         run=run,
         agents=agents,
-        curves=_load_arrays(directory / _CURVES),
+        curves={} if study.algorithm == "none" else _load_arrays(directory / _CURVES),
         evaluation=_load_arrays(directory / _EVALUATION),
     )
 
