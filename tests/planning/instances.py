@@ -28,6 +28,7 @@ def small_instance(number: int, *, devices: int | None = None, readings: bool = 
         count_unfinished_slot=bool(other[2]),
         uav_speed_m_s=float(rng.choice([0.5, 5.0])),
         uav_flying_power_w=float(rng.choice([40.0, 150.0])),
+        max_slots=SLOTS,
     )
     layout = sample_layout(jax.random.key(number), params, int(rng.integers(0, n)), int(rng.integers(0, n)))
     key = jax.random.key(1000 + number)

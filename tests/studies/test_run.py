@@ -143,6 +143,7 @@ def test_planners_play_the_same_draws_and_the_bound_holds(finished):
     assert (rich["beam_planned"] >= 33).all()
 
 
+@pytest.mark.slow
 def test_a_study_that_trains_nothing(tmp_path):
     changes = {"algorithm": "none", "axes.powered": [8], "evaluation.planners": ["bound"], "evaluation.draws": 3}
     study = parse_study(TOML, "tiny", changes | {"evaluation.baselines": ["oldest-first", "earliest-deadline"]})

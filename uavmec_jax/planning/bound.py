@@ -89,6 +89,9 @@ def upper_bound(params: Params, layout: Layout, volumes: Num[Array, "H n"], at_l
         layout: the devices.
         volumes: bytes, ``H`` from :func:`uavmec_jax.planning.beam.horizon`.
         at_least: a lifetime that some policy reached; the search starts there and is short if that is the optimum.
+
+    Raises:
+        ValueError: the volumes end before a life may.
     """
     params, layout, volumes = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], (params, layout, volumes))
     return int(upper_bounds(params, layout, volumes, np.array([at_least]))[0])
@@ -99,6 +102,9 @@ def upper_bounds(
 ) -> Int[np.ndarray, " B"]:
     """:func:`upper_bound` for ``B`` scenarios; every leaf has a leading ``B``."""
     found = {name: np.asarray(leaf) for name, leaf in _facts(params, layouts, volumes).items()}
+    slots = volumes.shape[1]
+    if np.any((found["counting"] >= slots) & (slots < np.asarray(params.max_slots))):
+        raise ValueError(f"volumes are given for {slots} slots, and lives may be longer; give more")
     found = {name: leaf.astype(float) if leaf.dtype == np.float32 else leaf for name, leaf in found.items()}
     facts = (
         _Facts(**{name: leaf[b] if leaf.ndim > 1 else leaf[b].item() for name, leaf in found.items()})
