@@ -89,7 +89,7 @@ def run(
 
     console = Console(stderr=as_json)
     resolved = load_study(study, overrides)
-    directory = out or Path("runs") / f"{resolved.name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    directory = out or _new_folder(resolved.name)
     check_directory(directory)
     plan = plan_study(resolved)
     console.print(f"[bold]{resolved.name}[/bold]: {plan}")
@@ -149,7 +149,7 @@ def plan(
         draws=draws,
         settings=dict(_setting(setting) for setting in settings),
     )
-    directory = out or Path("runs") / f"plan-{time.strftime('%Y%m%d-%H%M%S')}"
+    directory = out or _new_folder("plan")
     check_directory(directory)
     outlook = look_ahead(inventory.params, inventory.layout, keys, width=width)
     save_outlook(outlook, inventory, directory, _command())
@@ -242,6 +242,10 @@ def _print_tables(console: Any, tables: dict[str, Any], lines: list[str], direct
     for line in lines:
         console.print(line, highlight=False)
     console.print(f"Files: {directory}", highlight=False, soft_wrap=True)
+
+
+def _new_folder(name: str) -> Path:
+    return Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
 def _command() -> str:

@@ -165,6 +165,14 @@ def test_a_study_that_trains_nothing(tmp_path):
     assert figures.run_figure(again)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("powered", [[8, 4], [8]])
+def test_the_figure_of_heuristics_alone(powered):
+    changes = {"algorithm": "none", "evaluation.planners": [], "evaluation.baselines": ["random"]}
+    for axes in ({"axes.powered": powered}, {"axes.powered": powered, "axes.uav_speed_m_s": [5.0, 9.0]}):
+        assert figures.run_figure(run_study(parse_study(TOML, "tiny", changes | axes)))
+
+
 def leave_room_for(agents, study, monkeypatch):
     """Pretend that the host has memory for so many agents in training."""
     plan = plan_study(study)

@@ -138,6 +138,10 @@ BAD = [
         {"evaluation.planners": ["oracle"]},
         "bad.toml: evaluation.planners.0 is 'oracle'; it should be 'rollout', 'beam'",
     ),
+    (
+        {"algorithm": "none", "evaluation.baselines": [], "evaluation.planners": []},
+        "bad.toml: algorithm is 'none' and evaluation has neither baselines nor planners; name one to judge",
+    ),
     ({"evaluation.beam_width": 0}, "bad.toml: evaluation.beam_width is 0; it should be greater than or equal to 1"),
     ({"evaluation.planner_draws": 0}, "bad.toml: evaluation.planner_draws is 0; it should be greater"),
     ({"name": "../x"}, "bad.toml: name is '../x'"),

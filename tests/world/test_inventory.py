@@ -108,6 +108,7 @@ BAD = {
         "[params]\ntask_volume_range_bytes = [4e6, 2e6]\n" + ONE,
         "params.task_volume_range_bytes is [4000000.0, 2",
     ),
+    "origin": ("origin = [9.9, 95.0]\n" + ONE, "origin.1 is 95.0; it should be less than or equal to 89"),
     "toml": ("[[device]", "not TOML"),
     "table": ("device = [3]", "device 1 (3): "),
 }

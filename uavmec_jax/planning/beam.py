@@ -21,7 +21,7 @@ from uavmec_jax.planning import demand
 from uavmec_jax.planning.demand import SlotCosts
 from uavmec_jax.world.layout import Layout
 from uavmec_jax.world.params import Params
-from uavmec_jax.world.physics import Cause, State, initial_state, slots_to_expiry, transition
+from uavmec_jax.world.physics import Cause, Outcome, State, initial_state, slots_to_expiry, transition
 
 WIDTH = 64
 """States kept per slot by default. Four times as many lengthen one life in 400 by a slot."""
@@ -66,7 +66,7 @@ class _Problem(NamedTuple):
     charged: Any
     hover: Any
     calls_from: Any
-    hop: Any
+    round_m: Any
 
 
 def horizon(params: Params, layouts: Layout) -> int:
@@ -108,7 +108,7 @@ def beam_search(
     charged = demand.shares(layout, covers)
     hover = demand.fetched_from(covers, ~layout.has_power | ~layout.has_comms)
     calls_from = demand.fetched_from(covers, ~layout.has_comms)
-    problem = _Problem(params, layout, volumes, costs, charged, hover, calls_from, _typical_hop(layout, charged))
+    problem = _Problem(params, layout, volumes, costs, charged, hover, calls_from, _typical_round(layout, charged))
     aim = counting_bound(params, layout, costs)
     aim = aim if at_most is None else jnp.minimum(aim, at_most)
 
@@ -153,7 +153,7 @@ def counting_bound(params: Params, layout: Layout, costs: SlotCosts) -> Int[Arra
     return jnp.minimum(best, params.max_slots).astype(jnp.int32)
 
 
-def _typical_hop(layout: Layout, charged: Float[Array, " n"]) -> Float[Array, ""]:
+def _typical_round(layout: Layout, charged: Float[Array, " n"]) -> Float[Array, ""]:
     """Metres that one round through the devices without communication takes, guessed from nearest neighbours."""
     calls = ~layout.has_comms
     ground = jnp.linalg.norm(layout.position[:, None] - layout.position[None], axis=-1)
@@ -182,9 +182,7 @@ def _advance(problem: _Problem, aim: Int[Array, ""], width: int, beam: _Beam) ->
     """Visit every device from every state; keep the most promising states that nothing dominates."""
     params, layout = problem.params, problem.layout
     n = layout.capacity.shape[0]
-    volumes = problem.volumes[beam.slot]
-    visit = jax.vmap(lambda state, action: transition(params, layout, state, action, volumes), (None, 0))
-    after, outcome = jax.vmap(visit, (0, None))(beam.states, jnp.arange(n))
+    after, outcome = visit_all(params, layout, beam.states, problem.volumes[beam.slot])
 
     lives = jnp.where(beam.alive[:, None], after.slot, 0).reshape(-1)
     longest = jnp.argmax(lives)
@@ -210,6 +208,12 @@ def _advance(problem: _Problem, aim: Int[Array, ""], width: int, beam: _Beam) ->
     )
 
 
+def visit_all(params: Params, layout: Layout, states: State, volumes: Num[Array, " n"]) -> tuple[State, Outcome]:
+    """Every device visited from every state: leaves ``[W, ...]`` become ``[W, n, ...]``."""
+    visit = jax.vmap(lambda state, action: transition(params, layout, state, action, volumes), (None, 0))
+    return jax.vmap(visit, (0, None))(states, jnp.arange(volumes.shape[0]))
+
+
 def _promise(problem: _Problem, slot: Array, aim: Array, states: State) -> Float[Array, " W"]:
     """Minus the share of the remaining slots, and of the UAV's spare energy, that the way to the aim takes.
 
@@ -228,7 +232,7 @@ def _promise(problem: _Problem, slot: Array, aim: Array, states: State) -> Float
     paid = (number >= slot) & (number < aim - jnp.where(params.count_unfinished_slot, 1, 0))
     hovering = base * jnp.sum(jnp.where(paid, jnp.min(problem.costs.duration, axis=1), 0.0))
     spare = states.uav_energy * (1.0 + 1e-5) - hovering
-    flights = extra * problem.hop / params.uav_speed_m_s * left / jnp.maximum(slots_to_expiry(params), 1)
+    flights = extra * problem.round_m / params.uav_speed_m_s * left / jnp.maximum(slots_to_expiry(params), 1)
 
     lost = (
         jnp.any(hopeless, axis=-1)

@@ -41,7 +41,7 @@ def earliest_deadline(params: Params, layout: Layout, state: State, key: PRNGKey
     due = _due(params, layout, state, covers, slots)
     freshness = jnp.argmin(due + _TIE_PER_M * away)
 
-    drain = layout.standby_power * jnp.min(mean.duration) + mean.work
+    drain = demand.idle_drain(layout, mean)
     empties = jnp.where(services > 0, state.battery / jnp.maximum(drain, 1e-6), jnp.inf)
     battery = jnp.argmin(empties + _TIE_PER_M * away)
     here = jnp.where(jnp.min(away) <= 0.0, jnp.argmin(away), freshness)
@@ -67,7 +67,7 @@ def _hoped_for(
 ) -> tuple[Any, Float[Array, " n"]]:
     """Slots that may still be survived, and the services that each battery then needs."""
     shortest = jnp.min(mean.duration)
-    drain = layout.standby_power * shortest + mean.work
+    drain = demand.idle_drain(layout, mean)
     per_saving = jnp.where(layout.has_power, 0.0, 1.0 / jnp.maximum(mean.work - mean.upload, 1e-3))
     base, _ = demand.flight_power(params)
 

@@ -95,6 +95,11 @@ def mean_slot(params: Params, layout: Layout) -> SlotCosts:
     return jax.tree.map(lambda leaf: leaf[0], slot_costs(params, layout, volumes[None]))
 
 
+def idle_drain(layout: Layout, costs: SlotCosts) -> Float[Array, "*H n"]:
+    """J that each device's battery loses in a slot, if it is not served and the slot is as short as can be."""
+    return layout.standby_power * jnp.min(costs.duration, axis=-1, keepdims=True) + costs.work
+
+
 @struct.dataclass
 class BatteryDemand:
     """What surviving slots ``first .. last - 1`` asks of the batteries.
@@ -114,10 +119,9 @@ def battery_demand(layout: Layout, costs: SlotCosts, first: Int[Array, ""] | int
     """Drain and best savings over the slots ``first .. last - 1``: the largest savings are counted first."""
     slot = jnp.arange(costs.work.shape[0])[:, None]
     counts = (slot >= first) & (slot < last) & ~layout.has_power
-    drain = layout.standby_power * jnp.min(costs.duration, axis=1, keepdims=True) + costs.work
     saving = jnp.sort(jnp.where(counts, jnp.maximum(costs.work - costs.upload, 0.0), 0.0), axis=0, descending=True)
     return BatteryDemand(
-        drain=jnp.sum(jnp.where(counts, drain, 0.0), axis=0),
+        drain=jnp.sum(jnp.where(counts, idle_drain(layout, costs), 0.0), axis=0),
         saved=jnp.concatenate([jnp.zeros_like(saving[:1]), jnp.cumsum(saving, axis=0)]),
         slots=jnp.maximum(last - first, 0),
     )

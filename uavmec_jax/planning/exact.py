@@ -5,16 +5,14 @@ state, and a state is dropped only if another one at the same place is at least 
 the UAV's energy, for then every way on from the first is at least as long from the second.
 """
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from uavmec_jax.planning.beam import Tour
+from uavmec_jax.planning.beam import Tour, visit_all
 from uavmec_jax.world.layout import Layout
 from uavmec_jax.world.params import Params
-from uavmec_jax.world.physics import Cause, Outcome, State, initial_state, transition
+from uavmec_jax.world.physics import Cause, Outcome, State, initial_state
 
 MOST_STATES = 20_000
 
@@ -57,11 +55,7 @@ def _visit_all(params: Params, layout: Layout, states: State, volumes: np.ndarra
     return jax.tree.map(lambda leaf: np.asarray(leaf)[:count].reshape(count * n, *leaf.shape[2:]), found)
 
 
-@jax.jit
-def _step(params: Params, layout: Layout, states: State, volumes: jax.Array) -> tuple[State, Outcome]:
-    visit = partial(transition, params, layout)
-    everywhere = jax.vmap(lambda state, action: visit(state, action, volumes), (None, 0))
-    return jax.vmap(everywhere, (0, None))(states, jnp.arange(volumes.shape[0]))
+_step = jax.jit(visit_all)
 
 
 def _undominated(layout: Layout, states: State, place: np.ndarray) -> np.ndarray:

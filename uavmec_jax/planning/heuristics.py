@@ -55,8 +55,7 @@ def shortest_life(params: Params, layout: Layout, state: State, key: PRNGKeyArra
 
     A battery lasts ``battery / (standby + expected work)`` slots, data last until they expire.
     """
-    mean = demand.mean_slot(params, layout)
-    drain = layout.standby_power * jnp.min(mean.duration) + mean.work
+    drain = demand.idle_drain(layout, demand.mean_slot(params, layout))
     battery = jnp.where(layout.has_power, jnp.inf, state.battery / jnp.maximum(drain, 1e-6))
     data = jnp.where(layout.has_comms, jnp.inf, slots_to_expiry(params) - state.age)
     return jnp.argmin(jnp.minimum(battery, data)).astype(jnp.int32)

@@ -18,7 +18,6 @@ from uavmec_jax.world.params import Params
 from uavmec_jax.world.physics import Cause
 from uavmec_jax.world.rollout import Trace, tour_policy, trace
 
-DRAWS = 8
 WIDTH = 256
 CHANGES = ("repair power", "repair comms", "remove")
 

@@ -15,21 +15,20 @@ from uavmec_jax.studies.results import Results
 
 PANELS = (("best", "DQN, best weights"), ("last", "DQN, last weights"), ("oldest_first", "oldest data first"))
 LADDER = {
-    "oldest_first_planned": "oldest data first",
-    "earliest_deadline_planned": "earliest deadline",
-    "best_planned": "DQN, best weights",
-    "rollout_planned": "rollout planner",
-    "beam_planned": "clairvoyant beam",
-    "bound_planned": "upper bound",
+    "oldest_first": "oldest data first",
+    "earliest_deadline": "earliest deadline",
+    "rollout": "rollout planner",
+    "beam": "clairvoyant beam",
+    "bound": "upper bound",
 }
 """From what anyone would do to what nobody can pass."""
 
 
 def run_figure(results: Results) -> Figure:
-    """The figure of a run: the grids of a power x comms study, else its training curves."""
-    if is_grid(results):
-        return grid_figure(results) if results.curves else ladder_figure(results)
-    return curves_figure(results) if results.curves else ladder_figure(results)
+    """The figure of a run: the grids of a power x comms study, else its training curves; lifetimes if nothing trained."""
+    if not results.curves:
+        return ladder_figure(results)
+    return grid_figure(results) if is_grid(results) else curves_figure(results)
 
 
 def save(figure: Figure, path: Path) -> None:
@@ -53,46 +52,45 @@ def grid_figure(results: Results) -> Figure:
     """Lifetimes over power x comms as heat maps: ours (best, last), the paper's, oldest-first."""
     cells = results.cells()
     panels = [(name, title) for name, title in PANELS if name in cells]
-    figure = new_figure(3.3 * (len(panels) + 1), 3.6)
-    axes = figure.subplots(1, len(panels) + 1, sharey=True, squeeze=False)[0]
-    paper = cells.assign(
-        paper=[TABLE5.get((p, c), np.nan) for p, c in zip(cells.powered, cells.connected, strict=True)]
-    )
-    limits = (10.0, max(33.0, float(cells[[name for name, _ in panels]].max().max())))
-    for axis, (name, title) in zip(axes, [*panels, ("paper", "the paper, Table 5")], strict=True):
-        image = _heat_map(axis, paper.pivot(index="powered", columns="connected", values=name), limits)
-        axis.set_title(title, fontsize=10)
-        axis.set_xlabel("connected devices")
-    axes[0].set_ylabel("powered devices")
-    figure.colorbar(image, ax=axes, label="lifetime, slots", shrink=0.8)
+    paper = [TABLE5.get((p, c), np.nan) for p, c in zip(cells.powered, cells.connected, strict=True)]
     seeds = int(cells["seeds"].min())
-    figure.suptitle(
-        f"{results.study.name}: {len(cells)} cells x {seeds} seeds, {results.study.steps:,} steps each", fontsize=11
+    return _grids(
+        cells.assign(paper=paper),
+        [*panels, ("paper", "the paper, Table 5")],
+        float(cells[[name for name, _ in panels]].max().max()),
+        f"{results.study.name}: {len(cells)} cells x {seeds} seeds, {results.study.steps:,} steps each",
     )
-    return figure
 
 
 def ladder_figure(results: Results) -> Figure:
-    """Lifetimes on the planners' draws, from the heuristics up to the bound: heat maps of a grid, else bars."""
+    """Lifetimes from the heuristics up to the bound, on the planners' draws if there are any: heat maps, or bars."""
     cells = results.cells()
-    panels = [(name, title) for name, title in LADDER.items() if name in cells]
-    scenarios = f"{len(cells)} cells x {int(cells['seeds'].min())} layouts"
-    if not is_grid(results):
-        figure = new_figure(7, 3.6)
-        axis = figure.subplots()
-        axis.barh([title for _, title in panels], [cells[name].mean() for name, _ in panels])
-        axis.set_xlabel("lifetime, slots")
-    else:
-        figure = new_figure(3.3 * len(panels), 3.6)
-        axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-        for axis, (name, title) in zip(axes, panels, strict=True):
-            table = cells.pivot(index="powered", columns="connected", values=name)
-            image = _heat_map(axis, table, (10.0, max(33.0, float(cells[[name for name, _ in panels]].max().max()))))
-            axis.set_title(f"{title}: {cells[name].mean():.1f}", fontsize=10)
-            axis.set_xlabel("connected devices")
-        axes[0].set_ylabel("powered devices")
-        figure.colorbar(image, ax=axes, label="lifetime, slots", shrink=0.8)
-    figure.suptitle(f"{results.study.name}: {scenarios}", fontsize=11)
+    names = [name for name in LADDER if name in cells or f"{name}_planned" in cells] or results.policies
+    panels = [(f"{name}_planned" if f"{name}_planned" in cells else name, LADDER.get(name, name)) for name in names]
+    title = f"{results.study.name}: {len(cells)} cells x {int(cells['seeds'].min())} layouts"
+    if is_grid(results):
+        titled = [(name, f"{words}: {cells[name].mean():.1f}") for name, words in panels]
+        return _grids(cells, titled, float(cells[[name for name, _ in panels]].max().max()), title)
+    figure = new_figure(7, 3.6)
+    axis = figure.subplots()
+    axis.barh([words for _, words in panels], [cells[name].mean() for name, _ in panels])
+    axis.set_xlabel("lifetime, slots")
+    figure.suptitle(title, fontsize=11)
+    return figure
+
+
+def _grids(cells: pd.DataFrame, panels: list[tuple[str, str]], longest: float, title: str) -> Figure:
+    """Heat maps over power x comms side by side, one per column of ``cells`` and its title, on one scale."""
+    figure = new_figure(3.3 * len(panels), 3.6)
+    axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    for axis, (name, words) in zip(axes, panels, strict=True):
+        table = cells.pivot(index="powered", columns="connected", values=name)
+        image = _heat_map(axis, table, (10.0, max(33.0, longest)))
+        axis.set_title(words, fontsize=10)
+        axis.set_xlabel("connected devices")
+    axes[0].set_ylabel("powered devices")
+    figure.colorbar(image, ax=axes, label="lifetime, slots", shrink=0.8)
+    figure.suptitle(title, fontsize=11)
     return figure
 
 

@@ -2,20 +2,19 @@
 
 import json
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from rich.table import Table
 
-from uavmec_jax.planning.outlook import CHANGES, Outlook
+from uavmec_jax.planning.outlook import Outlook
 from uavmec_jax.reporting import figures
 from uavmec_jax.reporting.geojson import plan_geojson
 from uavmec_jax.reporting.route_figure import route_figure
 from uavmec_jax.reporting.tables import spoken
 from uavmec_jax.studies import host
-from uavmec_jax.studies.results import write_file
+from uavmec_jax.studies.results import write_text
 from uavmec_jax.world.inventory import Inventory
 from uavmec_jax.world.inventory_files import inventory_text
 from uavmec_jax.world.physics import Cause
@@ -169,7 +168,6 @@ def outlook_data(outlook: Outlook, names: Sequence[str], scenario: str) -> dict[
             }
             for one in outlook.what_if
         ],
-        "changes": list(CHANGES),
     }
 
 
@@ -185,11 +183,7 @@ def save_outlook(outlook: Outlook, inventory: Inventory, directory: Path, comman
         texts["plan.geojson"] = _json(plan_geojson(inventory, outlook))
     figures.save(route_figure(outlook, names, scenario), directory / "plan.png")
     for name, text in texts.items():
-        write_file(directory / name, partial(_write_text, text))
-
-
-def _write_text(text: str, file: IO[bytes]) -> None:
-    file.write(text.encode())
+        write_text(directory / name, text)
 
 
 def _json(data: dict[str, Any]) -> str:

@@ -52,7 +52,7 @@ def spoken(policy: str) -> str:
 
 def gap_title(results: Results) -> str:
     """What the lines of a cell of :func:`gap_table` say."""
-    steps = "; ".join(f"{spoken(lower)} to {spoken(upper)}" for upper, lower in results.gaps)
+    steps = "; ".join(_step(upper, lower) for upper, lower in results.gaps)
     return f"How far from the best possible, % (same layouts and volumes): {steps}"
 
 
@@ -158,8 +158,7 @@ def list_table(results: Results, cells: pd.DataFrame) -> Table:
     return table
 
 
-def _step(gap: Any) -> str:
-    upper, lower = str(gap).split("_over_")
+def _step(upper: str, lower: str) -> str:
     return f"{spoken(lower)} to {spoken(upper)}"
 
 
@@ -169,13 +168,14 @@ def summary(results: Results) -> list[str]:
     means = ", ".join(f"{name.replace('_', '-')} {cells[name].mean():.2f}" for name in results.policies)
     lines = [f"Mean over {len(cells)} cells, slots: {means}."]
     if results.gaps:
-        draws = len(
-            next(values[0] for name, values in results.evaluation.items() if name == f"{results.gaps[0][0]}/lifetime")
-        )
+        draws = results.evaluation[f"{results.gaps[0][0]}/lifetime"].shape[1]
         ladder = [results.gaps[0][1], *(upper for upper, _ in results.gaps)]
         means = ", ".join(f"{spoken(name)} {cells[f'{name}_planned'].mean():.2f}" for name in ladder)
         gaps = pd.DataFrame([gap_percent(results, cell) for _, cell in cells.iterrows()])
-        steps = ", ".join(f"{_step(name)} {gap.mean():.1f} (most {gap.max():.1f})" for name, gap in gaps.items())
+        steps = ", ".join(
+            f"{_step(*pair)} {gaps[name].mean():.1f} (most {gaps[name].max():.1f})"
+            for pair, name in zip(results.gaps, gaps, strict=True)
+        )
         lines.append(f"On the planners' draws ({draws} per layout): {means}. Gaps, %, mean over the cells: {steps}.")
     if "training_steps_per_second" in run:
         seconds = run["seconds"]

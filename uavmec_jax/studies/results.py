@@ -14,15 +14,12 @@ import pandas as pd
 from flax import traverse_util
 
 from uavmec_jax.errors import StudyError
-from uavmec_jax.studies.schema import Study
+from uavmec_jax.studies.schema import PLANNERS, Study
 from uavmec_jax.studies.statistics import mean_interval
 from uavmec_jax.studies.study import cell_axes, load_study, study_toml
 
 SCHEMA = 1
 """Version of the run folder."""
-
-PLANNERS = ("rollout", "beam", "bound")
-"""From what a UAV can do to what nobody can pass."""
 
 _STUDY, _RUN, _AGENTS = "study.toml", "run.json", "agents.csv"
 _CURVES, _EVALUATION, _WEIGHTS = "curves.npz", "evaluation.npz", "weights.npz"
@@ -114,14 +111,12 @@ class Results:
     def save(self, directory: Path) -> None:
         """Write every file of the run into ``directory``, each atomically; ``run.json`` last."""
         directory.mkdir(parents=True, exist_ok=True)
-        write_file(directory / _STUDY, lambda file: file.write(study_toml(self.study).encode()))
-        write_file(
-            directory / _AGENTS, lambda file: file.write(self.agents.to_csv(index=False, float_format="%.6g").encode())
-        )
+        write_text(directory / _STUDY, study_toml(self.study))
+        write_text(directory / _AGENTS, self.agents.to_csv(index=False, float_format="%.6g"))
         for name, arrays in ((_CURVES, self.curves), (_EVALUATION, self.evaluation), (_WEIGHTS, self.weights)):
             if arrays:  # nothing was trained: no curves, no weights
-                write_file(directory / name, partial(_save_arrays, arrays=arrays))
-        write_file(directory / _RUN, lambda file: file.write((json.dumps(self.run, indent=1) + "\n").encode()))
+                _write(directory / name, partial(_save_arrays, arrays=arrays))
+        write_text(directory / _RUN, json.dumps(self.run, indent=1) + "\n")
 
 
 def _first_to_fail(policy: str, share: np.ndarray) -> dict[str, Any]:
@@ -130,7 +125,12 @@ def _first_to_fail(policy: str, share: np.ndarray) -> dict[str, Any]:
     return {f"{policy}_first_device": device, f"{policy}_first_share": float(share.max())}
 
 
-def write_file(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:
+def write_text(path: Path, text: str) -> None:
+    """Write a text file whole or not at all."""
+    _write(path, lambda file: file.write(text.encode()))
+
+
+def _write(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:
     """Write a file whole or not at all."""
     partial = path.with_name(f".{path.name}.part")
     try:

@@ -122,21 +122,11 @@ def run_study(
     keys = evaluation_keys(study)
     who = pd.DataFrame(identities(study))
     seconds: dict[str, float] = {"evaluate": 0.0, "plan": 0.0}
-    blocks: Iterator[TrainedBlock | slice]
-    if algorithm is None:
-        blocks = _untrained(plan, on_progress)
-    else:
-        validation = Validation(every=study.evaluation.validate_every, draws=study.evaluation.validation_draws)
-        looks = validation_keys(study)
-        blocks = population.train(
-            algorithm, agents, looks, validation=validation, blocks=plan.blocks, on_progress=on_progress
-        )
     try:
-        for block in blocks:
-            _finish(results, algorithm, agents, keys, block, who, seconds)
-            if isinstance(block, TrainedBlock):
-                for activity, spent in block.seconds.items():
-                    seconds[activity] = seconds.get(activity, 0.0) + spent
+        for place, trained in _blocks(study, algorithm, agents, plan, on_progress):
+            _finish(results, algorithm, agents, keys, place, trained, who, seconds)
+            for activity, spent in trained.seconds.items() if trained else ():
+                seconds[activity] = seconds.get(activity, 0.0) + spent
             _measure(results, algorithm, plan, seconds, time.perf_counter() - started)
             if directory is not None:
                 results.save(directory)
@@ -145,12 +135,22 @@ def run_study(
     return results
 
 
-def _untrained(plan: Plan, on_progress: Callable[[Progress], None]) -> Iterator[slice]:
-    """The blocks of a study that trains nothing; progress counts scenarios."""
-    for block in range(plan.blocks.count):
-        done = slice(block * plan.blocks.size, min((block + 1) * plan.blocks.size, plan.agents))
-        yield done
-        on_progress(Progress(block, done.stop, plan.agents, float("nan")))
+def _blocks(
+    study: Study, algorithm: Algorithm | None, agents: Agent, plan: Plan, on_progress: Callable[[Progress], None]
+) -> Iterator[tuple[slice, TrainedBlock | None]]:
+    """Block after block, trained if the study trains; if not, progress counts scenarios."""
+    if algorithm is None:
+        for block in range(plan.blocks.count):
+            place = slice(block * plan.blocks.size, min((block + 1) * plan.blocks.size, plan.agents))
+            yield place, None
+            on_progress(Progress(block, place.stop, plan.agents, float("nan")))
+        return
+    looks = validation_keys(study)
+    validation = Validation(every=study.evaluation.validate_every, draws=study.evaluation.validation_draws)
+    for trained in population.train(
+        algorithm, agents, looks, validation=validation, blocks=plan.blocks, on_progress=on_progress
+    ):
+        yield trained.agents, trained
 
 
 def _finish(
@@ -158,24 +158,25 @@ def _finish(
     algorithm: Algorithm | None,
     agents: Agent,
     keys: Any,
-    block: TrainedBlock | slice,
+    place: slice,
+    trained: TrainedBlock | None,
     who: pd.DataFrame,
     seconds: dict[str, float],
 ) -> None:
     """Judge a block, trained or not, and add it to the results."""
-    place = block if isinstance(block, slice) else block.agents
     members = jax.tree.map(lambda leaf: leaf[place], agents)
     rows = who.iloc[place].reset_index(drop=True)
     weights: dict[str, Any] = {}
     curves: dict[str, Any] = {}
-    if isinstance(block, TrainedBlock):
-        weights = {"best": block.best, "last": block.last}
-        curves = {name: getattr(block, name) for name in ("chunk_steps", "episode_length", "look_steps", "validation")}
+    if algorithm and trained:
+        weights = {"best": trained.best, "last": trained.last}
+        names = ("chunk_steps", "episode_length", "look_steps", "validation")
+        curves = {name: getattr(trained, name) for name in names}
         rows = rows.assign(
-            steps=algorithm.total_steps if algorithm else 0,
-            diverged_at=block.diverged_at,
-            best_step=block.best_step,
-            best_validation=block.best_score,
+            steps=algorithm.total_steps,
+            diverged_at=trained.diverged_at,
+            best_step=trained.best_step,
+            best_validation=trained.best_score,
         )
     settings = results.study.evaluation
     tick = time.perf_counter()

@@ -11,7 +11,7 @@ from uavmec_jax.studies.study import held_out_draws, town
 from uavmec_jax.world.inventory import Inventory, inventory_of
 from uavmec_jax.world.inventory_files import load_inventory
 from uavmec_jax.world.params import Params
-from uavmec_jax.world.settings import ParamsSettings, check_ranges, one_line
+from uavmec_jax.world.settings import ParamsSettings, check_ranges, one_line, tuples
 
 MOST_DRAWS = 10_000
 
@@ -40,7 +40,7 @@ def load_scenario(
         LayoutError: the layout file is not usable.
         StudyError: a number does not fit.
     """
-    settings = {name: tuple(v) if isinstance(v, list) else v for name, v in (settings or {}).items()}
+    settings = tuples(settings or {})
     for name, value, most in (("seed", seed, 2**31 - 1), ("draws", draws, MOST_DRAWS)):
         if not (name == "draws") <= value <= most:
             raise StudyError(f"--{name} is {value}; give a whole number from {int(name == 'draws')} to {most}")

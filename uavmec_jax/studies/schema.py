@@ -37,6 +37,10 @@ Heuristic = Literal[
     "earliest-deadline",
 ]
 
+Planner = Literal["rollout", "beam", "bound"]
+PLANNERS: tuple[Planner, ...] = get_args(Planner)
+"""From what a UAV can do to what nobody can pass."""
+
 
 class Evaluation(Strict):
     """How policies are judged."""
@@ -48,7 +52,7 @@ class Evaluation(Strict):
     validation_draws: Annotated[int, Field(ge=1, le=1000)] = 16
     baselines: tuple[Heuristic, ...] = get_args(Heuristic)
     """Heuristics that play the same draws as the trained policies."""
-    planners: tuple[Literal["rollout", "beam", "bound"], ...] = ("rollout", "beam", "bound")
+    planners: tuple[Planner, ...] = PLANNERS
     """What says how far from the best possible the policies are; see ``docs/planning.md``."""
     planner_draws: Annotated[int, Field(ge=1, le=10_000)] = 8
     """The planners play the first of the held-out draws, this many (all of them if there are fewer)."""
@@ -78,6 +82,8 @@ class Study(Strict):
         _check_reward("reward", self.reward)
         _check_axes(self)
         check_ranges(self.params, "params.")
+        if self.algorithm == "none" and not self.evaluation.baselines + self.evaluation.planners:
+            raise ValueError("algorithm is 'none' and evaluation has neither baselines nor planners; name one to judge")
         return self
 
 

@@ -23,7 +23,7 @@ from uavmec_jax.world.environment import Scenario
 from uavmec_jax.world.layout import Layout, sample_layout
 from uavmec_jax.world.params import Params
 from uavmec_jax.world.rewards import make_reward
-from uavmec_jax.world.settings import nearest, one_line
+from uavmec_jax.world.settings import nearest, one_line, tuples
 
 # Streams of randomness: the seed of the root key. An agent's share of each hangs on its identity.
 _LAYOUT, _TRAINING, _VALIDATION, _HELD_OUT, _FIXED = range(5)
@@ -89,13 +89,8 @@ def parse_study(text: str, source: str, overrides: Mapping[str, Any] | None = No
 
 def _listed(data: dict[str, Any]) -> dict[str, Any]:
     """TOML arrays as tuples where a setting is a tuple (the checks do not convert)."""
-
-    def convert(table: Any) -> Any:
-        if not isinstance(table, dict):
-            return table
-        return {key: tuple(value) if isinstance(value, list) else value for key, value in table.items()}
-
-    return {key: convert(value) if key in ("dqn", "params", "evaluation") else value for key, value in data.items()}
+    settings = ("dqn", "params", "evaluation")
+    return {key: tuples(value) if key in settings and isinstance(value, dict) else value for key, value in data.items()}
 
 
 def study_toml(study: Study) -> str:

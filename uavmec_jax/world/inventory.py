@@ -15,7 +15,7 @@ from uavmec_jax.errors import LayoutError
 from uavmec_jax.world import tables
 from uavmec_jax.world.layout import Layout
 from uavmec_jax.world.params import Params
-from uavmec_jax.world.settings import ParamsSettings, Strict, check_ranges, nearest, wanted
+from uavmec_jax.world.settings import ParamsSettings, Strict, check_ranges, nearest, tuples, wanted
 
 MOST_DEVICES = 64
 OWN = -1
@@ -25,6 +25,8 @@ _EARTH_RADIUS_M = 6_371_008.8
 _OWN_FIELDS = ("standby_power_w", "active_power_w", "processing_rate_bytes_s")
 
 _Power = Annotated[float, Field(ge=0)]
+_Longitude = Annotated[float, Field(ge=-180, le=180)]
+_Latitude = Annotated[float, Field(ge=-89, le=89)]
 
 
 class Device(Strict):
@@ -33,8 +35,8 @@ class Device(Strict):
     name: Annotated[str, Field(min_length=1, max_length=80)]
     x_m: float | None = None
     y_m: float | None = None
-    lon: Annotated[float, Field(ge=-180, le=180)] | None = None
-    lat: Annotated[float, Field(ge=-89, le=89)] | None = None
+    lon: _Longitude | None = None
+    lat: _Latitude | None = None
     type: str | None = None
     """A name in :data:`tables.DEVICE_TYPES`; another one needs the three numbers below."""
     task: str | None = None
@@ -51,9 +53,8 @@ class InventoryFile(Strict):
     """What a layout file holds."""
 
     name: str = ""
-    origin: (
-        Annotated[tuple[float, float], Field(description="longitude, latitude of the corner x_m = y_m = 0")] | None
-    ) = None
+    origin: tuple[_Longitude, _Latitude] | None = None
+    """Longitude and latitude of the corner x_m = y_m = 0."""
     params: ParamsSettings = ParamsSettings()
     device: tuple[Device, ...] = ()
 
@@ -104,7 +105,7 @@ def make_inventory(data: dict[str, Any], source: str, overrides: dict[str, Any] 
     """
     if isinstance(data.get("params", {}), dict):
         given = data.get("params", {}) | (overrides or {})
-        data = data | {"params": {k: tuple(v) if isinstance(v, list) else v for k, v in given.items()}}
+        data = data | {"params": tuples(given)}
     try:
         file = InventoryFile.model_validate(data)
     except pydantic.ValidationError as error:

@@ -10,6 +10,7 @@ import tomli_w
 
 from uavmec_jax.errors import LayoutError
 from uavmec_jax.world.inventory import Device, Inventory, make_inventory
+from uavmec_jax.world.settings import tuples
 
 
 def load_inventory(path: str | Path, overrides: dict[str, Any] | None = None) -> Inventory:
@@ -40,7 +41,7 @@ def _from_toml(text: str, path: Path) -> dict[str, Any]:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise LayoutError(f"{path}: not TOML: {error}") from None
-    return {key: tuple(value) if isinstance(value, list) else value for key, value in data.items()}
+    return tuples(data)
 
 
 def _from_csv(text: str) -> dict[str, Any]:

@@ -75,23 +75,39 @@ def recorded(
 def _play(
     policy: Policy, params: Params, layout: Layout, state: State, key: PRNGKeyArray, slots: int
 ) -> tuple[Array, Episode]:
+    play_slot = _slot_player(policy, params, layout, key)
+
+    def going_on(carry: tuple[State, Outcome, Array]) -> Array:
+        return _goes_on(params, *carry[:2])
+
+    def next_slot(carry: tuple[State, Outcome, Array]) -> tuple[State, Outcome, Array]:
+        state, _, visited = carry
+        action, after, outcome = play_slot(state)
+        return after, outcome, visited.at[state.slot].set(action, mode="drop") if slots else visited
+
+    start = (state, _nothing(layout.capacity.shape[0]), jnp.full(slots, -1, jnp.int32))
+    state, outcome, visited = jax.lax.while_loop(going_on, next_slot, start)
+    ended = Episode(length=state.slot, cause=outcome.cause, failed=outcome.failed, first_failure=outcome.first_failure)
+    return visited, ended
+
+
+def _goes_on(params: Params, state: State, outcome: Outcome) -> Array:
+    """Whether another slot is played."""
+    return (outcome.cause == Cause.NONE) & (state.slot < params.max_slots)
+
+
+def _slot_player(
+    policy: Policy, params: Params, layout: Layout, key: PRNGKeyArray
+) -> Callable[[State], tuple[Array, State, Outcome]]:
+    """What plays one slot of the episode of ``key``: the policy's action, the state after it, the outcome."""
     n = layout.capacity.shape[0]
     policy_key = jax.random.fold_in(key, _POLICY_STREAM)
 
-    def alive(carry: tuple[State, Outcome, Array]) -> Array:
-        state, outcome, _ = carry
-        return (outcome.cause == Cause.NONE) & (state.slot < params.max_slots)
-
-    def play_slot(carry: tuple[State, Outcome, Array]) -> tuple[State, Outcome, Array]:
-        state, _, visited = carry
+    def play_slot(state: State) -> tuple[Array, State, Outcome]:
         action = policy(params, layout, state, jax.random.fold_in(policy_key, state.slot))
-        after, outcome = transition(params, layout, state, action, slot_volumes(params, n, key, state.slot))
-        return after, outcome, visited.at[state.slot].set(action, mode="drop") if slots else visited
+        return action, *transition(params, layout, state, action, slot_volumes(params, n, key, state.slot))
 
-    start = (state, _nothing(n), jnp.full(slots, -1, jnp.int32))
-    state, outcome, visited = jax.lax.while_loop(alive, play_slot, start)
-    ended = Episode(length=state.slot, cause=outcome.cause, failed=outcome.failed, first_failure=outcome.first_failure)
-    return visited, ended
+    return play_slot
 
 
 def _nothing(n: int) -> Outcome:
@@ -129,19 +145,16 @@ class Trace:
 
 def trace(policy: Policy, params: Params, layout: Layout, key: PRNGKeyArray, slots: int) -> Trace:
     """The first ``slots`` slots of the episode that :func:`rollout` plays with the same key."""
-    n = layout.capacity.shape[0]
-    policy_key = jax.random.fold_in(key, _POLICY_STREAM)
+    play_slot = _slot_player(policy, params, layout, key)
 
-    def play_slot(carry: tuple[State, Outcome], slot: Array) -> tuple[tuple[State, Outcome], Trace]:
-        state, last = carry
-        played = (last.cause == Cause.NONE) & (slot < params.max_slots)
-        action = policy(params, layout, state, jax.random.fold_in(policy_key, state.slot))
-        new = transition(params, layout, state, action, slot_volumes(params, n, key, slot))
-        state, outcome = jax.tree.map(lambda new, old: jnp.where(played, new, old), new, carry)
+    def play_if(carry: tuple[State, Outcome], _: None) -> tuple[tuple[State, Outcome], Trace]:
+        played = _goes_on(params, *carry)
+        action, *new = play_slot(carry[0])
+        state, outcome = jax.tree.map(lambda new, old: jnp.where(played, new, old), tuple(new), carry)
         return (state, outcome), Trace(played=played, action=action, state=state, outcome=outcome)
 
-    start = (initial_state(params, layout), _nothing(n))
-    return jax.lax.scan(play_slot, start, jnp.arange(slots))[1]
+    start = (initial_state(params, layout), _nothing(layout.capacity.shape[0]))
+    return jax.lax.scan(play_if, start, None, length=slots)[1]
 
 
 def tour_policy(actions: Int[Array, " H"]) -> Policy:

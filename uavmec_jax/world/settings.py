@@ -3,6 +3,7 @@
 import dataclasses
 import difflib
 import math
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import pydantic
@@ -46,6 +47,11 @@ def settings_model(name: str, *declarations: type, leave_out: tuple[str, ...] = 
 
 
 ParamsSettings: Any = settings_model("ParamsSettings", Params)
+
+
+def tuples(table: Mapping[str, Any]) -> dict[str, Any]:
+    """A table of a file with its arrays as tuples, which is what the strict models want."""
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in table.items()}
 
 
 def check_ranges(settings: Any, where: str) -> None:
