@@ -31,7 +31,7 @@ def run(out: Path, name: str, seeds: list[int], steps: int, learning_rates: list
 
 
 def draw(axis: object, results: Results, agent: int, label: str) -> None:
-    curves = results.curves
+    curves = results.curves["dqn"]
     per_look = np.diff(np.searchsorted(curves["chunk_steps"], curves["look_steps"], side="right"), prepend=0)
     ends = np.cumsum(per_look)
     training = [

@@ -134,6 +134,7 @@ def test_update_against_numpy(max_grad_norm):
         reward=jnp.asarray(rng.normal(size=16), jnp.float32),
         terminated=jnp.asarray(rng.random(16) < 0.3, jnp.float32),
         next_observation=jnp.asarray(observation[1]),
+        discount=jnp.full(16, hyper.gamma),
     )
     agent = make_agent(0)
     state = dqn.init(spec, agent)

@@ -69,14 +69,14 @@ def test_read_back_equals_what_was_run(finished):
     again = load_results(directory)
     assert again.study == results.study
     pd.testing.assert_frame_equal(again.agents, results.agents, check_dtype=False, rtol=1e-5)
-    for mine, theirs in ((results.curves, again.curves), (results.evaluation, again.evaluation)):
+    for mine, theirs in ((results.curves["dqn"], again.curves["dqn"]), (results.evaluation, again.evaluation)):
         assert mine.keys() == theirs.keys()
         for name in mine:
             assert_array_equal(mine[name], theirs[name])
-    assert results.curves["validation"].shape == (8, 3)
+    assert results.curves["dqn"]["validation"].shape == (8, 3)
     assert results.evaluation["best/lifetime"].shape == (8, 6)
     kernel = load_weights(directory)["params"]["TorchDense_0"]["kernel"]
-    assert_array_equal(kernel, results.weights["best/params/TorchDense_0/kernel"])
+    assert_array_equal(kernel, results.weights["dqn/best/params/TorchDense_0/kernel"])
     with pytest.raises(StudyError, match="holds no 'worst' weights"):
         load_weights(directory, "worst")
 
@@ -176,7 +176,7 @@ def test_the_figure_of_heuristics_alone(powered):
 def leave_room_for(agents, study, monkeypatch):
     """Pretend that the host has memory for so many agents in training."""
     plan = plan_study(study)
-    free = _BYTES_WITHOUT_TRAINING * plan.agents + agents * plan.blocks.bytes // plan.blocks.size
+    free = _BYTES_WITHOUT_TRAINING * plan.agents + agents * plan.blocks["dqn"].bytes // plan.blocks["dqn"].size
     monkeypatch.setattr(host, "free_memory", lambda: free)
 
 
@@ -185,19 +185,19 @@ def test_blocks_one_after_the_other_give_every_agent_once(finished, monkeypatch)
     study = finished[0].study
     study = study.model_copy(update={"evaluation": study.evaluation.model_copy(update={"planners": ()})})
     leave_room_for(2, study, monkeypatch)
-    assert plan_study(study).blocks.count == 4
+    assert plan_study(study).n_blocks == 4
     pieces = run_study(study)
     assert pieces.run["complete"]
     pd.testing.assert_frame_equal(pieces.agents.iloc[:, :3], finished[0].agents.iloc[:, :3])
     assert_array_equal(pieces.evaluation["oldest_first/lifetime"], finished[0].evaluation["oldest_first/lifetime"])
-    assert pieces.curves["validation"].shape == (8, 3)
+    assert pieces.curves["dqn"]["validation"].shape == (8, 3)
 
 
 @pytest.mark.slow
 def test_interrupted_run_keeps_the_finished_blocks(finished, monkeypatch, tmp_path):
     study = parse_study(TOML, "tiny", {"evaluation.planners": [], "evaluation.baselines": []})
     leave_room_for(4, study, monkeypatch)
-    assert plan_study(study).blocks.count == 2
+    assert plan_study(study).n_blocks == 2
 
     def interrupt(progress):
         if progress.block == 1:
@@ -264,5 +264,5 @@ def test_same_study_twice_is_equal_to_the_bit(finished):
     again = run_study(results.study)
     for name, leaf in results.weights.items():
         assert_array_equal(leaf, again.weights[name])
-    assert_array_equal(results.curves["episode_length"], again.curves["episode_length"])
+    assert_array_equal(results.curves["dqn"]["episode_length"], again.curves["dqn"]["episode_length"])
     assert np.isfinite(results.agents["best_lifetime"]).all()

@@ -1,11 +1,10 @@
-"""Deep Q-learning as the paper ran it (Stable-Baselines3's DQN with Table 4): one agent, two pure functions.
+"""Deep Q-learning as the paper ran it (Stable-Baselines3's DQN with Table 4), and its usual variants: one agent.
 
 ``init`` makes an agent's state, ``update`` advances it by a stretch of iterations; one iteration is ``train_frequency``
 environment steps and one gradient step. The population (:mod:`uavmec_jax.learning.population`) adds the agent axis with
 ``vmap``: the iteration number is shared by all agents and never batched, everything of one agent is.
 """
 
-import itertools
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -18,8 +17,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, UInt
 
 from uavmec_jax.learning import replay
 from uavmec_jax.learning.algorithm import AGENTS_AXIS, Agent, Algorithm
-from uavmec_jax.learning.networks import QNetwork
-from uavmec_jax.learning.optimizers import MAX_LEARNING_RATE, clipped_adam, global_norm
+from uavmec_jax.learning.networks import QNetwork, n_weights, scale_ages
+from uavmec_jax.learning.optimizers import Descent, clipped_adam, descend
 from uavmec_jax.world.environment import advance, draw_volumes, is_truncated, observe, restart_if
 from uavmec_jax.world.layout import Layout
 from uavmec_jax.world.params import Params
@@ -41,7 +40,9 @@ class DQNHyper:
     exploration_fraction: Any = struct.field(default=0.35, metadata={"gt": 0, "le": 1})
     """Share of all steps over which epsilon falls linearly."""
     target_interval: Any = struct.field(default=10_000, metadata={"ge": 1})
-    """Environment steps of one agent between copies of the target network."""
+    """Environment steps of one agent between updates of the target network."""
+    tau: Any = struct.field(default=1.0, metadata={"gt": 0, "le": 1})
+    """Share of the online network in an update of the target: 1 copies it, less is a soft update."""
     learning_starts: Any = struct.field(default=100, metadata={"ge": 0})
     """Environment steps of one agent with random actions and without gradient steps."""
     max_grad_norm: Any = struct.field(default=10.0, metadata={"gt": 0})
@@ -60,6 +61,12 @@ class DQNSpec:
     train_frequency: int = field(default=4, metadata={"ge": 1, "le": 64})
     """Environment steps per gradient step."""
     replay_capacity: int = field(default=1_000_000, metadata={"ge": 1})
+    double: bool = False
+    """The online network chooses the next action, the target network judges it (van Hasselt et al., 2016)."""
+    dueling: bool = False
+    """State value and advantages instead of Q-values (Wang et al., 2016)."""
+    n_step: int = field(default=1, metadata={"ge": 1, "le": 64})
+    """Rewards summed before the bootstrap (Sutton, 1988)."""
     n_devices: int = 12
     max_age: int = 11
 
@@ -71,7 +78,7 @@ class DQNSpec:
     @property
     def network(self) -> QNetwork:
         """The Q-network."""
-        return QNetwork(n_actions=self.n_devices, hidden=self.hidden)
+        return QNetwork(n_actions=self.n_devices, hidden=self.hidden, dueling=self.dueling)
 
     @property
     def replay(self) -> replay.ReplaySpec:
@@ -83,14 +90,13 @@ class DQNSpec:
             stride=self.train_frequency,
             max_age=self.max_age,
             wraps=self.replay_capacity < steps,
+            n_step=self.n_step,
         )
 
     @property
     def agent_bytes(self) -> int:
         """Memory of one agent in training, bytes: replay, weights, target, moments, gradient, best weights."""
-        widths = (2 * self.n_devices, *self.hidden, self.n_devices)
-        weights = sum((i + 1) * o for i, o in itertools.pairwise(widths))
-        return self.replay.bytes + 6 * 4 * weights
+        return self.replay.bytes + 6 * 4 * n_weights(self.network, 2 * self.n_devices)
 
 
 @struct.dataclass
@@ -176,11 +182,14 @@ def target_is_due(spec: DQNSpec, hyper: DQNHyper, steps_done: Any) -> Bool[Array
     return steps_done // hyper.target_interval > (steps_done - spec.train_frequency) // hyper.target_interval
 
 
+def mix_if(due: Bool[ArrayLike, ""], tau: Any, weights: Any, target: Any) -> Any:
+    """The target network after an update, if one is due; with ``tau`` 1 it is the weights to the bit."""
+    return jax.tree.map(lambda new, old: jnp.where(due, tau * new + (1.0 - tau) * old, old), weights, target)
+
+
 def q_values(spec: DQNSpec, hyper: DQNHyper, weights: Any, observation: Float[Array, "*b two_n"]) -> Array:
     """Q-values ``[..., n]``; the ages are scaled as the agent's hyperparameters say."""
-    n = spec.n_devices
-    scale = jnp.where(jnp.arange(2 * n) < n, 1.0, hyper.age_scale)
-    values: Any = spec.network.apply(weights, observation * scale)
+    values: Any = spec.network.apply(weights, scale_ages(observation, hyper.age_scale))
     return values
 
 
@@ -194,9 +203,13 @@ def policy(spec: DQNSpec, hyper: DQNHyper, weights: Any) -> Policy:
 
 
 def td_loss(spec: DQNSpec, hyper: DQNHyper, weights: Any, target: Any, batch: replay.Transition) -> Float[Array, ""]:
-    """Smooth-L1 loss of a minibatch ``[B]`` against the one-step target (paper, equations 2 and 3)."""
-    best_next = jnp.max(q_values(spec, hyper, target, batch.next_observation), axis=-1)
-    goal = batch.reward + (1.0 - batch.terminated) * hyper.gamma * best_next
+    """Smooth-L1 loss of a minibatch ``[B]`` against the bootstrapped target (paper, equations 2 and 3)."""
+    next_values = q_values(spec, hyper, target, batch.next_observation)
+    best_next = jnp.max(next_values, axis=-1)
+    if spec.double:
+        chosen_next = jnp.argmax(q_values(spec, hyper, weights, batch.next_observation), axis=-1)
+        best_next = jnp.sum(next_values * jax.nn.one_hot(chosen_next, spec.n_devices), axis=-1)
+    goal = batch.reward + (1.0 - batch.terminated) * batch.discount * best_next
     chosen = jax.nn.one_hot(batch.action, spec.n_devices)
     value = jnp.sum(q_values(spec, hyper, weights, batch.observation) * chosen, axis=-1)
     return jnp.mean(optax.huber_loss(value, goal))
@@ -223,10 +236,10 @@ def _iteration(spec: DQNSpec, agent: Agent, state: DQNState, i: Int[Array, ""]) 
     due = target_is_due(spec, agent.hyper, steps_done)
     target = jax.lax.cond(  # a true branch: the predicate is the same for all agents
         jax.lax.pmax(due, AGENTS_AXIS),
-        lambda: jax.tree.map(lambda new, old: jnp.where(due, new, old), state.weights, state.target),
+        lambda: mix_if(due, agent.hyper.tau, state.weights, state.target),
         lambda: state.target,
     )
-    batch = replay.sample(spec.replay, rows, steps_done, bits[n_acting:])
+    batch = replay.sample(spec.replay, rows, steps_done, bits[n_acting:], agent.hyper.gamma)
     return _learn(spec, agent.hyper, replace(state, rows=rows, target=target), batch, steps_done)
 
 
@@ -256,29 +269,17 @@ def _act(
 
 
 def _learn(spec: DQNSpec, hyper: DQNHyper, state: DQNState, batch: replay.Transition, steps_done: Any) -> DQNState:
-    """One gradient step, unless the agent is still warming up or has diverged.
-
-    A loss or gradient that is not finite, or a learning rate beyond :data:`MAX_LEARNING_RATE`, freezes the agent with
-    the finite weights it has; see there why nothing else needs to be looked at.
-    """
+    """One gradient step, unless the agent is still warming up or has diverged."""
     loss, gradient = jax.value_and_grad(lambda w: td_loss(spec, hyper, w, state.target, batch))(state.weights)
-    norm = global_norm(gradient)
-    learning = steps_done > hyper.learning_starts
-    sound = jnp.isfinite(loss) & jnp.isfinite(norm) & (jnp.abs(hyper.learning_rate) <= MAX_LEARNING_RATE)
-    frozen = (state.diverged_at >= 0) | (learning & ~sound)
-    steps, moments = clipped_adam().update(
+    after = descend(
+        clipped_adam(),
+        Descent(state.weights, state.moments, state.diverged_at),
+        loss,
         gradient,
-        state.moments,
         learning_rate=hyper.learning_rate,
         max_norm=hyper.max_grad_norm,
-        norm=norm,
         count=gradient_steps(spec, hyper, steps_done),
-        enabled=learning & ~frozen,
+        steps_done=steps_done,
+        learning=steps_done > hyper.learning_starts,
     )
-    return replace(
-        state,
-        weights=optax.apply_updates(state.weights, steps),
-        moments=moments,
-        loss=loss,
-        diverged_at=jnp.where(frozen & (state.diverged_at < 0), steps_done, state.diverged_at),
-    )
+    return replace(state, weights=after.weights, moments=after.moments, diverged_at=after.diverged_at, loss=loss)

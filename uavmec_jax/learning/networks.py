@@ -1,4 +1,7 @@
-"""Networks of the learners: small dense stacks, initialised as PyTorch initialises its linear layers."""
+"""Networks of the learners: small dense stacks, initialised as Stable-Baselines3 initialises its own."""
+
+import math
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -48,21 +51,114 @@ class TorchDense(nn.Module):
         return (matmul(x, kernel) if x.ndim > 1 else x @ kernel) + bias
 
 
+def orthogonal(key: Array, shape: tuple[int, int], gain: float) -> Float[Array, "i o"]:
+    """A uniformly random matrix with orthonormal columns (rows, if there are fewer), times ``gain``.
+
+    Gram-Schmidt on Gaussian columns, each made orthogonal twice to be so to rounding. (Not LAPACK's QR: several of
+    them at once on several CPU devices wait for each other for ever in jaxlib 0.10.)
+    """
+    rows, columns = max(shape), min(shape)
+    gaussian = jax.random.normal(key, (rows, columns))
+
+    def add_column(k: Any, basis: Array) -> Array:
+        column = gaussian[:, k]
+        for _ in range(2):
+            column = column - basis @ (column @ basis)
+        return basis.at[:, k].set(column / jnp.linalg.norm(column))
+
+    basis = gain * jax.lax.fori_loop(0, columns, add_column, jnp.zeros((rows, columns)))
+    return basis if shape[0] >= shape[1] else basis.T
+
+
+class OrthogonalDense(nn.Module):
+    """Dense layer with orthogonal weights times ``gain`` and zero biases."""
+
+    features: int
+    gain: float
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "b i"]) -> Float[Array, "b o"]:
+        """Apply the layer to ``[batch, i]``."""
+        kernel = self.param("kernel", orthogonal, (x.shape[-1], self.features), self.gain)
+        return matmul(x, kernel) + self.param("bias", nn.initializers.zeros, (self.features,))
+
+
 class QNetwork(nn.Module):
     """The paper's Q-network: ReLU layers, then one value per action.
 
     Attributes:
         n_actions: number of actions, one per device.
         hidden: widths of the hidden layers; (64, 64) in the paper.
+        dueling: whether the head is a state value and advantages of mean zero (Wang et al., 2016, equation 9).
+    """
+
+    n_actions: int
+    hidden: tuple[int, ...] = (64, 64)
+    dueling: bool = False
+
+    @nn.compact
+    def __call__(self, observation: Float[Array, "... two_n"]) -> Float[Array, "... n"]:
+        """Q-values ``[..., n]`` of observations ``[..., 2n]``; at most one batch axis where gradients are taken."""
+        x = observation
+        for width in self.hidden:
+            x = nn.relu(TorchDense(width)(x))
+        values = TorchDense(self.n_actions)(x)
+        if self.dueling:
+            values = TorchDense(1)(x) + values - jnp.mean(values, axis=-1, keepdims=True)
+        return values
+
+
+class MLP(nn.Module):
+    """Tanh layers with orthogonal weights (gain sqrt 2), then a linear head."""
+
+    features: int
+    hidden: tuple[int, ...]
+    head_gain: float
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "b i"]) -> Float[Array, "b o"]:
+        """Apply the stack to ``[batch, i]``."""
+        for width in self.hidden:
+            x = nn.tanh(OrthogonalDense(width, math.sqrt(2.0))(x))
+        return OrthogonalDense(self.features, self.head_gain)(x)
+
+
+class ActorCritic(nn.Module):
+    """Separate networks for policy and value, as Stable-Baselines3's PPO and A2C have them.
+
+    Attributes:
+        n_actions: number of actions, one per device.
+        hidden: widths of the hidden layers of each.
     """
 
     n_actions: int
     hidden: tuple[int, ...] = (64, 64)
 
-    @nn.compact
-    def __call__(self, observation: Float[Array, "... two_n"]) -> Float[Array, "... n"]:
-        """Q-values ``[..., n]`` of observations ``[..., 2n]``; at most one batch axis."""
-        x = observation
-        for width in self.hidden:
-            x = nn.relu(TorchDense(width)(x))
-        return TorchDense(self.n_actions)(x)
+    def setup(self) -> None:
+        """Declare the two networks."""
+        self.policy = MLP(self.n_actions, self.hidden, head_gain=0.01)
+        self.critic = MLP(1, self.hidden, head_gain=1.0)
+
+    def logits(self, observation: Float[Array, "b two_n"]) -> Float[Array, "b n"]:
+        """Unnormalised log-probabilities ``[B, n]`` of the actions."""
+        return self.policy(observation)
+
+    def value(self, observation: Float[Array, "b two_n"]) -> Float[Array, " b"]:
+        """State values ``[B]``."""
+        return self.critic(observation)[:, 0]
+
+    def __call__(self, observation: Float[Array, "b two_n"]) -> tuple[Array, Array]:
+        """Logits and values."""
+        return self.logits(observation), self.value(observation)
+
+
+def n_weights(network: nn.Module, observation_size: int) -> int:
+    """Number of weights of a network, without making them."""
+    made: Any = jax.eval_shape(network.init, jax.random.key(0), jnp.zeros((1, observation_size)))
+    return sum(leaf.size for leaf in jax.tree.leaves(made))
+
+
+def scale_ages(observation: Float[Array, "*b two_n"], age_scale: Any) -> Float[Array, "*b two_n"]:
+    """An observation with its ages, the second half, multiplied by ``age_scale``."""
+    size = observation.shape[-1]
+    return observation * jnp.where(jnp.arange(size) < size // 2, 1.0, age_scale)

@@ -7,7 +7,7 @@ Battery fractions and rewards are kept to the bit; ages are small integers and a
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,8 @@ class Transition(NamedTuple):
     """A batch of transitions, leading axis ``B``.
 
     ``observation`` and ``next_observation`` are f32 ``[B, 2n]``, ``action`` int32 ``[B]``, ``reward`` f32 ``[B]``,
-    ``terminated`` f32 ``[B]`` (1 where the bootstrap is cut).
+    ``terminated`` f32 ``[B]`` (1 where the bootstrap is cut), ``discount`` f32 ``[B]`` of the bootstrap. With n-step
+    returns the reward is the discounted sum up to ``next_observation``.
     """
 
     observation: Array
@@ -31,6 +32,7 @@ class Transition(NamedTuple):
     reward: Array
     terminated: Array
     next_observation: Array
+    discount: Array
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,7 @@ class ReplaySpec:
         stride: transitions written at a time; the ring is a multiple of it, so a write never wraps.
         max_age: largest age that can occur, slots.
         wraps: whether more than ``capacity`` transitions will ever be written.
+        n_step: transitions that one sample sums up.
     """
 
     n_devices: int
@@ -50,6 +53,7 @@ class ReplaySpec:
     stride: int = 4
     max_age: int = 11
     wraps: bool = True
+    n_step: int = 1
 
     @property
     def ring(self) -> int:
@@ -117,7 +121,11 @@ def add(
 
 
 def sample(
-    spec: ReplaySpec, rows: UInt[Array, "rows words"], written: Int[Array, ""], bits: UInt[Array, " B"]
+    spec: ReplaySpec,
+    rows: UInt[Array, "rows words"],
+    written: Int[Array, ""],
+    bits: UInt[Array, " B"],
+    gamma: Any,
 ) -> Transition:
     """Draw transitions uniformly with replacement from the newest ``min(written, capacity)``.
 
@@ -126,6 +134,7 @@ def sample(
         rows: the memory.
         written: transitions written so far, at least 1.
         bits: ``[B]`` uniform 32-bit words, one per draw. (The modulo's bias is below capacity / 2**32.)
+        gamma: discount of one slot.
     """
     size = jnp.minimum(written, spec.capacity)
     back = (bits % size.astype(jnp.uint32)).astype(jnp.int32)
@@ -133,13 +142,46 @@ def sample(
     pairs = jax.vmap(lambda start: jax.lax.dynamic_slice(rows, (start, 0), (2, spec.words)))(place)
     before, row = pairs[:, 0], pairs[:, 1]
     first = np.concatenate([np.ones(spec.n_devices, np.float32), np.zeros(spec.n_devices, np.float32)])
+    reward, discount, last = _reward(row), jnp.broadcast_to(jnp.asarray(gamma, jnp.float32), back.shape), row
+    if spec.n_step > 1:
+        reward, discount, last = _n_step(spec, rows, place, back, row, gamma)
     return Transition(
         observation=jnp.where((before[:, -1:] & _ENDED) > 0, first, _observation(spec, before)),
         action=(row[:, -1] & (_TERMINATED - 1)).astype(jnp.int32),
-        reward=jax.lax.bitcast_convert_type(row[:, -2], jnp.float32),
-        terminated=((row[:, -1] & _TERMINATED) > 0).astype(jnp.float32),
-        next_observation=_observation(spec, row),
+        reward=reward,
+        terminated=((last[:, -1] & _TERMINATED) > 0).astype(jnp.float32),
+        next_observation=_observation(spec, last),
+        discount=discount,
     )
+
+
+def _n_step(
+    spec: ReplaySpec,
+    rows: UInt[Array, "rows words"],
+    place: Int[Array, " B"],
+    back: Int[Array, " B"],
+    row: UInt[Array, "B words"],
+    gamma: Any,
+) -> tuple[Array, Array, Array]:
+    """Discounted sum of up to ``n_step`` rewards, discount of the bootstrap, and the last row summed.
+
+    A sum stops where an episode ends and at the newest transition, as in Stable-Baselines3; it is then bootstrapped
+    after the slots it has.
+    """
+    goes_on = jnp.ones(place.shape, bool)
+    total, discount, last = jnp.zeros(place.shape), jnp.ones(place.shape), row
+    for k in range(spec.n_step):
+        now = rows[1 + (place + k) % spec.ring]
+        goes_on = goes_on & (back >= k)
+        total = total + jnp.where(goes_on, discount * _reward(now), 0.0)
+        discount = jnp.where(goes_on, discount * gamma, discount)
+        last = jnp.where(goes_on[:, None], now, last)
+        goes_on = goes_on & ((now[:, -1] & _ENDED) == 0)
+    return total, discount, last
+
+
+def _reward(row: UInt[Array, "B words"]) -> Float[Array, " B"]:
+    return jax.lax.bitcast_convert_type(row[:, -2], jnp.float32)
 
 
 def _observation(spec: ReplaySpec, row: UInt[Array, "B words"]) -> Float[Array, "B two_n"]:

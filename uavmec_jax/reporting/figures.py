@@ -9,11 +9,12 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from uavmec_jax.reporting.comparison import ALGORITHM_NAMES, is_comparison, label_rewards
 from uavmec_jax.reporting.tables import is_grid
 from uavmec_jax.studies.paper import TABLE5
 from uavmec_jax.studies.results import Results
 
-PANELS = (("best", "DQN, best weights"), ("last", "DQN, last weights"), ("oldest_first", "oldest data first"))
+PANELS = (("best", "best weights"), ("last", "last weights"), ("oldest_first", "oldest data first"))
 LADDER = {
     "oldest_first": "oldest data first",
     "earliest_deadline": "earliest deadline",
@@ -28,6 +29,8 @@ def run_figure(results: Results) -> Figure:
     """The figure of a run: the grids of a power x comms study, else its training curves; lifetimes if nothing trained."""
     if not results.curves:
         return ladder_figure(results)
+    if is_comparison(results):
+        return comparison_figure(results)
     return grid_figure(results) if is_grid(results) else curves_figure(results)
 
 
@@ -51,7 +54,8 @@ def new_figure(width: float, height: float) -> Figure:
 def grid_figure(results: Results) -> Figure:
     """Lifetimes over power x comms as heat maps: ours (best, last), the paper's, oldest-first."""
     cells = results.cells()
-    panels = [(name, title) for name, title in PANELS if name in cells]
+    learner = ALGORITHM_NAMES.get(results.study.algorithm, "")
+    panels = [(name, f"{learner}, {title}" if "weights" in title else title) for name, title in PANELS if name in cells]
     paper = [TABLE5.get((p, c), np.nan) for p, c in zip(cells.powered, cells.connected, strict=True)]
     seeds = int(cells["seeds"].min())
     return _grids(
@@ -85,6 +89,7 @@ def _grids(cells: pd.DataFrame, panels: list[tuple[str, str]], longest: float, t
     axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     for axis, (name, words) in zip(axes, panels, strict=True):
         table = cells.pivot(index="powered", columns="connected", values=name)
+        table = table.sort_index(ascending=False).sort_index(axis=1, ascending=False)
         image = _heat_map(axis, table, (10.0, max(33.0, longest)))
         axis.set_title(words, fontsize=10)
         axis.set_xlabel("connected devices")
@@ -95,7 +100,6 @@ def _grids(cells: pd.DataFrame, panels: list[tuple[str, str]], longest: float, t
 
 
 def _heat_map(axis: Axes, table: pd.DataFrame, limits: tuple[float, float]) -> mpl.image.AxesImage:
-    table = table.sort_index(ascending=False).sort_index(axis=1, ascending=False)
     image = axis.imshow(table.to_numpy(), vmin=limits[0], vmax=limits[1], cmap="viridis")
     axis.set_xticks(range(table.shape[1]), [str(name) for name in table.columns])
     axis.set_yticks(range(table.shape[0]), [str(name) for name in table.index])
@@ -107,6 +111,27 @@ def _heat_map(axis: Axes, table: pd.DataFrame, limits: tuple[float, float]) -> m
     return image
 
 
+def comparison_figure(results: Results) -> Figure:
+    """Rewards against algorithms and cells, one heat map per log guard: mean lifetime of the best weights."""
+    cells = results.cells()
+    cells["reward"] = label_rewards(cells)
+    cells["column"] = [
+        f"{ALGORITHM_NAMES[name]}\n{powered} / {connected}"
+        for name, powered, connected in zip(cells.algorithm, cells.powered, cells.connected, strict=True)
+    ]
+    order = [list(dict.fromkeys(cells[name])) for name in ("reward", "column")]
+    table = cells.pivot(index="reward", columns="column", values="best").loc[order[0], order[1]]
+    figure = new_figure(1.5 + 0.75 * len(order[1]), 1.2 + 0.33 * len(order[0]))
+    axis = figure.subplots()
+    image = _heat_map(axis, table, (10.0, max(33.0, float(cells["best"].max()))))
+    figure.colorbar(image, ax=axis, label="lifetime, slots", shrink=0.8)
+    seeds = int(cells["seeds"].min())
+    axis.set_title(
+        f"{results.study.name}: best weights, mean over {seeds} seeds; columns: powered / connected", fontsize=10
+    )
+    return figure
+
+
 def curves_figure(results: Results) -> Figure:
     """Training curves: episode length while exploring, and the greedy policy on validation draws, for every agent."""
     figure = new_figure(9, 3.6)
@@ -115,12 +140,17 @@ def curves_figure(results: Results) -> Figure:
         (left, "chunk_steps", "episode_length", "while training"),
         (right, "look_steps", "validation", "greedy policy"),
     )
+    alone = len(results.curves) == 1
     for axis, steps, values, title in pairs:
-        axis.plot(results.curves[steps], results.curves[values].T, lw=0.6, alpha=0.35, color="tab:blue")
-        axis.plot(results.curves[steps], np.nanmean(results.curves[values], axis=0), lw=2, color="tab:orange")
+        for k, (algorithm, curves) in enumerate(results.curves.items()):
+            x, y = curves[steps], curves[values]
+            axis.plot(x, y.T, lw=0.6, alpha=0.35 if alone else 0.15, color=f"C{2 * k}")
+            name = ALGORITHM_NAMES[algorithm]
+            axis.plot(x, np.nanmean(y, axis=0), lw=2, color=f"C{2 * k + 1}", label=f"{name}, mean")
         axis.set_xlabel("environment steps of one agent")
         axis.set_title(f"{title}: every agent, and their mean", fontsize=10)
         axis.grid(alpha=0.3)
+    right.legend()
     left.set_ylabel("episode length, slots")
     figure.suptitle(f"{results.study.name}: {len(results.agents)} agents", fontsize=11)
     return figure

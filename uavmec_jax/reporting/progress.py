@@ -33,7 +33,7 @@ def progress_bar(console: Console, plan: Plan) -> Iterator[Callable[[News], None
             bar.update(
                 task,
                 completed=news.steps,
-                description=f"block {news.block + 1}/{plan.blocks.count}",
+                description=f"block {news.block + 1}/{plan.n_blocks}",
                 speed=f"{speed:,.0f}" if speed else "-",
                 length="-" if math.isnan(news.mean_length) else f"{news.mean_length:.1f}",
             )

@@ -1,13 +1,15 @@
 """Judge policies: every one plays the same layouts and the same volume draws through the same rollout."""
 
+import time
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 from jaxtyping import Array, Key
 
 from uavmec_jax.learning.algorithm import Agent, Algorithm
@@ -67,36 +69,35 @@ def _device(share: np.ndarray) -> int:
     return int(share.argmax()) + 1 if share.max() > 0 else 0
 
 
-def judge(
-    algorithm: Algorithm | None,
-    agents: Agent,
-    keys: Key[Array, "A D"],
-    weights: Mapping[str, Any],
-    baselines: Iterable[str],
+def judge_learned(
+    algorithm: Algorithm, agents: Agent, keys: Key[Array, "A D"], weights: Mapping[str, Any]
 ) -> dict[str, Judgement]:
-    """Play every policy on every agent's scenario.
+    """Play every agent's learned policies on its scenario.
 
     Args:
-        algorithm: makes policies from weights; ``None`` if there are none.
+        algorithm: makes policies from weights.
         agents: leaves ``[A, ...]``.
         keys: ``[A, D + 1]`` volume draws, from :func:`uavmec_jax.studies.study.evaluation_keys`.
         weights: name -> trained weights, leaves ``[A, ...]``.
-        baselines: names in :data:`HEURISTICS`.
     """
-    learned = weights.items() if algorithm else ()
-    episodes = {name: _play_learned(algorithm, agents, keys, trained) for name, trained in learned}
-    names = tuple(baselines)
-    if names:
-        played = play_heuristics(names, agents.scenario.params, agents.scenario.layout, keys)
-        episodes |= {name: jax.tree.map(lambda leaf, k=k: leaf[k], played) for k, name in enumerate(names)}
-    return {
-        name: Judgement(
-            lifetime=np.asarray(episode.length),
-            cause=np.asarray(episode.cause, np.int8),
-            first_failure=np.asarray(episode.first_failure),
-        )
-        for name, episode in episodes.items()
-    }
+    return {name: _judgement(_play_learned(algorithm, agents, keys, trained)) for name, trained in weights.items()}
+
+
+def judge_heuristics(agents: Agent, keys: Key[Array, "A D"], names: Iterable[str]) -> dict[str, Judgement]:
+    """Play heuristics, by their names in :data:`HEURISTICS`, on every agent's scenario and ``[A, D + 1]`` draws."""
+    names = tuple(names)
+    if not names:
+        return {}
+    played = play_heuristics(names, agents.scenario.params, agents.scenario.layout, keys)
+    return {name: _judgement(jax.tree.map(lambda leaf, k=k: leaf[k], played)) for k, name in enumerate(names)}
+
+
+def _judgement(episode: Episode) -> Judgement:
+    return Judgement(
+        lifetime=np.asarray(episode.length),
+        cause=np.asarray(episode.cause, np.int8),
+        first_failure=np.asarray(episode.first_failure),
+    )
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,7 @@ def judge_planners(
         agents: leaves ``[A, ...]``.
         keys: ``[A, D]`` the held-out draws.
         settings: which planners, how many draws, how wide.
-        lifetimes: ``[A, D]`` of every policy that played the same draws; the bound starts from the longest.
+        lifetimes: ``[A, D]`` of policies that played the same draws; the bound starts from the longest.
     """
     draws = min(settings.planner_draws, keys.shape[1])
     shape = (keys.shape[0], draws)
@@ -173,6 +174,82 @@ def planned_columns(
             columns[f"{name}_first_device"] = [_device(row) for row in often]
             columns[f"{name}_first_share"] = often.max(axis=1)
     return columns
+
+
+@dataclass(frozen=True)
+class Distinct:
+    """Which of ``A`` agents play the same scenario and draws, so that what nobody learned is played once for all of them.
+
+    Attributes:
+        first: ``[S]`` the first agent of each scenario.
+        scenario: ``[A]`` the scenario of each agent.
+    """
+
+    first: np.ndarray
+    scenario: np.ndarray
+
+    @classmethod
+    def of(cls, played: pd.DataFrame) -> "Distinct":
+        """From the columns that say what is played, one row per agent."""
+        scenario = played.groupby(list(played), sort=False).ngroup().to_numpy()
+        return cls(first=np.unique(scenario, return_index=True)[1], scenario=scenario)
+
+    def longest(self, lifetimes: np.ndarray) -> np.ndarray:
+        """``[S, ...]`` the longest of ``[A, ...]`` lifetimes in each scenario."""
+        found = np.zeros((len(self.first), *lifetimes.shape[1:]), lifetimes.dtype)
+        np.maximum.at(found, self.scenario, lifetimes)
+        return found
+
+    def to_agents(self, judgement: Any) -> Any:
+        """A judgement of ``S`` scenarios as one of ``A`` agents."""
+        fields = {name: getattr(judgement, name) for name in judgement.__dataclass_fields__}
+        return replace(judgement, **{name: leaf[self.scenario] for name, leaf in fields.items() if leaf is not None})
+
+
+def judge_all(
+    agents: Agent,
+    keys: Key[Array, "A D"],
+    learned: dict[str, Judgement],
+    distinct: Distinct,
+    settings: Evaluation,
+    seconds: dict[str, float],
+    started: float,
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Judge heuristics and planners beside the learned policies.
+
+    Args:
+        agents: leaves ``[A, ...]``.
+        keys: ``[A, D + 1]`` volume draws.
+        learned: from :func:`judge_learned`.
+        distinct: which agents play the same.
+        settings: who plays.
+        seconds: ``evaluate`` and ``plan`` grow by what was spent, the former since ``started``.
+        started: of :func:`time.perf_counter`.
+
+    Returns:
+        Columns of the tidy table, and every episode by ``policy/field``.
+    """
+    once, draws = jax.tree.map(lambda leaf: leaf[distinct.first], (agents, keys))
+    heuristics = judge_heuristics(once, draws, settings.baselines)
+    tock = time.perf_counter()
+    reached = [distinct.longest(judged.lifetime) for judged in learned.values()]
+    reached += [judged.lifetime for judged in heuristics.values()]
+    planned = {
+        name: distinct.to_agents(judged)
+        for name, judged in judge_planners(once, draws[:, :-1], settings, reached).items()
+    }
+    seconds["evaluate"] += tock - started
+    seconds["plan"] += time.perf_counter() - tock
+    judgements = learned | {name: distinct.to_agents(judged) for name, judged in heuristics.items()}
+    columns = {name: values for policy, judged in judgements.items() for name, values in judged.columns(policy).items()}
+    everyone: dict[str, Judgement | PlannedJudgement] = {**judgements, **planned}
+    evaluation = {
+        f"{policy.replace('-', '_')}/{name}": values
+        for policy, anyone in everyone.items()
+        for name, values in asdict(anyone).items()
+        if values is not None
+    }
+    return columns | planned_columns(judgements, planned), evaluation
 
 
 # Jitted here and not inside `judge`, so that the blocks of a run share one compilation.

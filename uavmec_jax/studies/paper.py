@@ -20,3 +20,31 @@ TABLE5: Mapping[tuple[int, int], float] = MappingProxyType(
     }
 )
 """Table 5: (powered, connected) -> average episode length in slots."""
+
+_REWARDS = {
+    "A": (16, 11, 11, 19, 19, 12, 18, 11, 11),
+    "U": (15, 11, 11, 17, 11, 11, 13, 11, 11),
+    "M": (12, 11, 11, 11, 13, 11, 23, 11, 16),
+    "-O": (11, 11, 11, 14, 15, 11, 16, 11, 11),
+    "A+U+M-O": (17, 11, 14, 16, 11, 11, 16, 11, 11),
+    "log A": (13, 15, 11, 23, 15, 18, 11, 14, 11),
+    "log U": (11, 15, 11, 19, 11, 11, 11, 14, 11),
+    "log M": (11, 11, 11, 11, 11, 11, 11, 11, 11),
+    "-log O": (11, 11, 11, 18, 11, 11, 28, 14, 11),
+    "log A+log U+log M-log O": (17, 12, 11, 18, 11, 11, 14, 22, 11),
+    "U+log(A/O)": (18, 15, 11, 28, 18, 12, 30, 21, 12),
+}
+_COLUMNS = [
+    (powered, connected, algorithm)
+    for powered, connected in ((6, 6), (8, 8), (10, 8))
+    for algorithm in ("dqn", "ppo", "a2c")
+]
+
+TABLE6: Mapping[tuple[str, int, int, str], float] = MappingProxyType(
+    {
+        (reward, *column): float(slots)
+        for reward, row in _REWARDS.items()
+        for column, slots in zip(_COLUMNS, row, strict=True)
+    }
+)
+"""Table 6: (reward, powered, connected, algorithm) -> maximum episode length in slots."""

@@ -18,8 +18,8 @@ from uavmec_jax.studies.schema import PLANNERS, Study
 from uavmec_jax.studies.statistics import mean_interval
 from uavmec_jax.studies.study import cell_axes, load_study, study_toml
 
-SCHEMA = 1
-"""Version of the run folder."""
+SCHEMA = 2
+"""Version of the run folder. In version 1 curves and weights did not name their algorithm: it was the DQN."""
 
 _STUDY, _RUN, _AGENTS = "study.toml", "run.json", "agents.csv"
 _CURVES, _EVALUATION, _WEIGHTS = "curves.npz", "evaluation.npz", "weights.npz"
@@ -33,16 +33,18 @@ class Results:
         study: the resolved study.
         run: what ``run.json`` holds: versions, hardware, command, seeds, times, speed.
         agents: tidy table, one row per finished agent.
-        curves: ``chunk_steps [C]``, ``episode_length [A, C]``, ``look_steps [L]``, ``validation [A, L]``.
+        curves: per algorithm, of its agents: ``chunk_steps [C]``, ``episode_length [A, C]``, ``look_steps [L]``,
+            ``validation [A, L]``.
         evaluation: per policy ``<name>/lifetime [A, D + 1]``, ``/cause``, ``/first_failure [A, D + 1, n]``; of the
             planners ``[A, P]`` and ``[A, P, n]``, the bound has lifetimes only.
-        weights: ``best/...`` and ``last/...``, leaves ``[A, ...]`` (empty when read back by :func:`load_results`).
+        weights: ``<algorithm>/best/...`` and ``<algorithm>/last/...``, leaves ``[A, ...]`` of its agents (empty when
+            read back by :func:`load_results`).
     """
 
     study: Study
     run: dict[str, Any]
     agents: pd.DataFrame = field(default_factory=pd.DataFrame)
-    curves: dict[str, np.ndarray] = field(default_factory=dict)
+    curves: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
     evaluation: dict[str, np.ndarray] = field(default_factory=dict)
     weights: dict[str, np.ndarray] = field(default_factory=dict)
 
@@ -68,14 +70,15 @@ class Results:
         """Learned policies to be held against oldest-first, layout by layout."""
         return [name for name in ("best", "last") if {name, "oldest_first"} <= set(self.policies)]
 
-    def add(self, rows: pd.DataFrame, curves: Mapping, evaluation: Mapping, weights: Mapping[str, Any]) -> None:
-        """Append the agents of one more block."""
-        flat = traverse_util.flatten_dict(dict(weights), sep="/")
+    def add(
+        self, algorithm: str, rows: pd.DataFrame, curves: Mapping, evaluation: Mapping, weights: Mapping[str, Any]
+    ) -> None:
+        """Append the agents of one more block of an algorithm."""
         self.agents = pd.concat([self.agents, rows], ignore_index=True)
-        for mine, theirs in ((self.curves, curves), (self.evaluation, evaluation), (self.weights, flat)):
-            for name, values in theirs.items():
-                shared = name.endswith("_steps")
-                mine[name] = np.concatenate([mine[name], values]) if name in mine and not shared else np.asarray(values)
+        if curves:
+            _append(self.curves.setdefault(algorithm, {}), curves)
+        _append(self.evaluation, evaluation)
+        _append(self.weights, traverse_util.flatten_dict({algorithm: dict(weights)}, sep="/") if weights else {})
 
     def cells(self) -> pd.DataFrame:
         """One row per cell: means and intervals over the seeds, paired differences to oldest-first, who fails first."""
@@ -85,6 +88,7 @@ class Results:
             for policy in self.policies:
                 mean, low, high = mean_interval(group[f"{policy}_lifetime"].to_numpy())
                 row |= {policy: mean, f"{policy}_low": low, f"{policy}_high": high}
+                row[f"{policy}_max"] = float(group[f"{policy}_lifetime"].max())
                 row[f"{policy}_fixed"] = float(group[f"{policy}_lifetime_fixed"].mean())
                 share = self.first_failures(policy)[group.index].mean(axis=0)
                 row |= _first_to_fail(policy, share)
@@ -113,10 +117,18 @@ class Results:
         directory.mkdir(parents=True, exist_ok=True)
         write_text(directory / _STUDY, study_toml(self.study))
         write_text(directory / _AGENTS, self.agents.to_csv(index=False, float_format="%.6g"))
-        for name, arrays in ((_CURVES, self.curves), (_EVALUATION, self.evaluation), (_WEIGHTS, self.weights)):
+        curves = traverse_util.flatten_dict(self.curves, sep="/")
+        for name, arrays in ((_CURVES, curves), (_EVALUATION, self.evaluation), (_WEIGHTS, self.weights)):
             if arrays:  # nothing was trained: no curves, no weights
                 _write(directory / name, partial(_save_arrays, arrays=arrays))
         write_text(directory / _RUN, json.dumps(self.run, indent=1) + "\n")
+
+
+def _append(mine: dict[str, np.ndarray], theirs: Mapping[str, Any]) -> None:
+    """Arrays with an axis of agents grow by those of a block; the steps of curves are shared by all."""
+    for name, values in theirs.items():
+        grows = name in mine and not name.endswith("_steps")
+        mine[name] = np.concatenate([mine[name], values]) if grows else np.asarray(values)
 
 
 def _first_to_fail(policy: str, share: np.ndarray) -> dict[str, Any]:
@@ -155,23 +167,33 @@ def load_results(directory: str | Path) -> Results:
         StudyError: the folder holds no run, a file of it is damaged, or it was written by a newer version.
     """
     directory = Path(directory)
-    if not (directory / _RUN).is_file():
-        raise StudyError(f"{directory}: holds no run ({_RUN} is not there)")
+    run = _read_run(directory)
     try:
-        run = json.loads((directory / _RUN).read_text(encoding="utf-8"))
         agents = _read_table(directory / _AGENTS)
     except (OSError, ValueError) as error:
         raise StudyError(f"{directory}: cannot be read: {error}") from None
-    if run.get("schema", SCHEMA) > SCHEMA:
-        raise StudyError(f"{directory / _RUN}: schema is {run['schema']}; this version reads up to {SCHEMA}")
     study = load_study(directory / _STUDY)
     return Results(
         study=study,
         run=run,
         agents=agents,
-        curves={} if study.algorithm == "none" else _load_arrays(directory / _CURVES),
+        curves=_load_nested(directory / _CURVES, run.get("schema", 1)) if study.algorithms else {},
         evaluation=_load_arrays(directory / _EVALUATION),
     )
+
+
+def _read_run(directory: Path) -> dict[str, Any]:
+    """What ``run.json`` holds."""
+    path = directory / _RUN
+    if not path.is_file():
+        raise StudyError(f"{directory}: holds no run ({_RUN} is not there)")
+    try:
+        run: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise StudyError(f"{directory}: cannot be read: {error}") from None
+    if run.get("schema", SCHEMA) > SCHEMA:
+        raise StudyError(f"{path}: schema is {run['schema']}; this version reads up to {SCHEMA}")
+    return run
 
 
 def _read_table(path: Path) -> pd.DataFrame:
@@ -180,17 +202,33 @@ def _read_table(path: Path) -> pd.DataFrame:
     return pd.read_csv(path, dtype=lists, keep_default_na=False)
 
 
-def load_weights(directory: str | Path, which: str = "best") -> dict[str, Any]:
+def load_weights(directory: str | Path, which: str = "best", algorithm: str | None = None) -> dict[str, Any]:
     """Trained weights of a run as the networks take them, leaves ``[A, ...]`` in the order of ``agents.csv``.
+
+    Args:
+        directory: of the run.
+        which: ``"best"`` or ``"last"``.
+        algorithm: whose agents; by default the first algorithm of the run.
 
     Raises:
         StudyError: there are none, or the file is damaged.
     """
-    arrays = _load_arrays(Path(directory) / _WEIGHTS)
-    chosen = {name.removeprefix(f"{which}/"): leaf for name, leaf in arrays.items() if name.startswith(f"{which}/")}
+    directory = Path(directory)
+    nested = _load_nested(directory / _WEIGHTS, _read_run(directory).get("schema", 1))
+    algorithm = next(iter(nested)) if algorithm is None else algorithm
+    chosen: dict[str, Any] = nested.get(algorithm, {}).get(which, {})
     if not chosen:
-        raise StudyError(f"{Path(directory) / _WEIGHTS}: holds no {which!r} weights; give 'best' or 'last'")
-    return traverse_util.unflatten_dict(chosen, sep="/")
+        raise StudyError(
+            f"{directory / _WEIGHTS}: holds no {which!r} weights of {algorithm}; "
+            f"give 'best' or 'last' and one of {', '.join(nested)}"
+        )
+    return chosen
+
+
+def _load_nested(path: Path, schema: int) -> dict[str, Any]:
+    """Arrays by the parts of their names, the first of which is the algorithm."""
+    nested: dict[str, Any] = traverse_util.unflatten_dict(_load_arrays(path), sep="/")
+    return nested if schema > 1 else {"dqn": nested}
 
 
 def _save_arrays(file: IO[bytes], arrays: dict[str, Any]) -> None:

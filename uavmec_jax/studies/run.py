@@ -3,8 +3,8 @@
 import datetime
 import sys
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,18 +17,20 @@ from uavmec_jax.learning.algorithm import Agent, Algorithm
 from uavmec_jax.learning.blocks import Blocks, PopulationTooLargeError, plan_blocks
 from uavmec_jax.learning.population import Progress, TrainedBlock, Validation
 from uavmec_jax.studies import host
-from uavmec_jax.studies.evaluation import Judgement, PlannedJudgement, judge, judge_planners, planned_columns
+from uavmec_jax.studies.evaluation import Distinct, Judgement, judge_all, judge_learned
 from uavmec_jax.studies.results import SCHEMA, Results, holds_run
-from uavmec_jax.studies.schema import Study
+from uavmec_jax.studies.schema import TRACED_PARAMS, Study
 from uavmec_jax.studies.study import (
     evaluation_keys,
     identities,
     make_agents,
     make_algorithm,
     n_agents,
+    parts,
     seeds_of,
     validation_keys,
 )
+from uavmec_jax.world.rewards import make_reward
 
 
 @dataclass(frozen=True)
@@ -37,16 +39,28 @@ class Plan:
 
     agents: int
     total_steps: int
-    blocks: Blocks
+    blocks: dict[str, Blocks]
+    """Algorithm -> how its agents are cut."""
     free_bytes: int
+
+    @property
+    def n_blocks(self) -> int:
+        """Blocks of all algorithms."""
+        return sum(blocks.count for blocks in self.blocks.values())
 
     def __str__(self) -> str:
         if not self.total_steps:
             return f"{self.agents} scenarios, nothing is trained"
-        blocks = f"{self.blocks.count} block{'s' * (self.blocks.count > 1)} of {self.blocks.size}"
-        memory = f"{self.blocks.bytes / 2**30:.2f} GiB of {self.free_bytes / 2**30:.1f} GiB free"
-        devices = f"{self.blocks.devices} device{'s' * (self.blocks.devices > 1)}"
-        return f"{self.agents} agents x {self.total_steps // self.agents:,} steps in {blocks} on {devices}, {memory}"
+        every = list(self.blocks.values())
+        each = self.n_blocks > 1
+        sizes = "+".join(f"{blocks.count} x {blocks.size}" for blocks in every)
+        cut = f"{self.n_blocks} block{'s' * each}{f' ({sizes})' if len(every) > 1 else f' of {every[0].size}'}"
+        memory = f"{max(b.bytes for b in every) / 2**30:.2f} GiB of {self.free_bytes / 2**30:.1f} GiB free"
+        devices = max(blocks.devices for blocks in every)
+        return (
+            f"{self.agents} agents x {self.total_steps // self.agents:,} steps in {cut} "
+            f"on {devices} device{'s' * (devices > 1)}, {memory}"
+        )
 
 
 def plan_study(study: Study) -> Plan:
@@ -55,22 +69,27 @@ def plan_study(study: Study) -> Plan:
     Raises:
         StudyError: the population does not fit in memory.
     """
-    algorithm, agents, free = make_algorithm(study), n_agents(study), host.free_memory()
+    agents, free = n_agents(study), host.free_memory()
     needed = agents * _BYTES_WITHOUT_TRAINING
     if needed > free:
         raise StudyError(
             f"{study.name}: {agents:,} agents need {needed / 2**30:,.0f} GiB before any of them trains, "
             f"{free / 2**30:.1f} GiB are free; shorten an axis"
         )
-    if algorithm is None:
-        size = min(_UNTRAINED_BLOCK, agents)
-        blocks = Blocks(count=-(-agents // size), size=size, devices=jax.local_device_count(), bytes=0)
-        return Plan(agents=agents, total_steps=0, blocks=blocks, free_bytes=free)
-    try:
-        blocks = plan_blocks(agents, algorithm.agent_bytes, free - needed)
-    except PopulationTooLargeError as error:
-        raise StudyError(f"{study.name}: steps is {study.steps}: {error}") from None
-    return Plan(agents=agents, total_steps=agents * algorithm.total_steps, blocks=blocks, free_bytes=free)
+    blocks: dict[str, Blocks] = {}
+    total_steps = 0
+    for part in parts(study):
+        algorithm, members = make_algorithm(part), n_agents(part)
+        if algorithm is None:
+            size = min(_UNTRAINED_BLOCK, members)
+            blocks[part.algorithm] = Blocks(-(-members // size), size, jax.local_device_count(), bytes=0)
+            continue
+        try:
+            blocks[part.algorithm] = plan_blocks(members, algorithm.agent_bytes, free - needed)
+        except PopulationTooLargeError as error:
+            raise StudyError(f"{study.name}: steps is {study.steps}: {error}") from None
+        total_steps += members * algorithm.total_steps
+    return Plan(agents=agents, total_steps=total_steps, blocks=blocks, free_bytes=free)
 
 
 _UNTRAINED_BLOCK = 100
@@ -96,6 +115,7 @@ def run_study(
     study: Study,
     directory: Path | None = None,
     *,
+    reward: Callable[[Mapping[str, Any]], Any] | None = None,
     command: str | None = None,
     on_progress: Callable[[Progress], None] = lambda _: None,
 ) -> Results:
@@ -107,94 +127,123 @@ def run_study(
     Args:
         study: from :func:`uavmec_jax.studies.study.load_study`.
         directory: where to save; ``None`` saves nothing.
+        reward: a function of the terms (see :func:`um.make_reward`) in place of the study's reward; the run's label
+            then names it.
         command: the command line, for the label of the results.
         on_progress: told after every chunk.
 
     Raises:
-        StudyError: the population does not fit, or the directory cannot take a run.
+        StudyError: the population does not fit, the directory cannot take a run, or ``reward`` stands beside an axis of
+            rewards.
     """
     if directory is not None:
         check_directory(directory)
+    if reward is not None and "reward" in study.axes:
+        raise StudyError(f"{study.name}: axes.reward is given, and a reward function too; leave one of them out")
     plan = plan_study(study)
     started = time.perf_counter()
     results = Results(study=study, run=_label(study, plan, command))
-    algorithm, agents = make_algorithm(study), make_agents(study)
-    keys = evaluation_keys(study)
-    who = pd.DataFrame(identities(study))
+    if reward is not None:
+        results.run["reward_function"] = getattr(reward, "__qualname__", repr(reward))
     seconds: dict[str, float] = {"evaluate": 0.0, "plan": 0.0}
+    steps_before = 0
     try:
-        for place, trained in _blocks(study, algorithm, agents, plan, on_progress):
-            _finish(results, algorithm, agents, keys, place, trained, who, seconds)
-            for activity, spent in trained.seconds.items() if trained else ():
-                seconds[activity] = seconds.get(activity, 0.0) + spent
-            _measure(results, algorithm, plan, seconds, time.perf_counter() - started)
-            if directory is not None:
-                results.save(directory)
+        for part in parts(study):
+            own = make_reward(reward, study.guard) if reward is not None else None
+            members = _Population(part, make_algorithm(part), make_agents(part, own), evaluation_keys(part))
+            report = _report(on_progress, plan, part.algorithm, steps_before)
+            for place, trained in members.blocks(plan.blocks[part.algorithm], report):
+                members.finish(results, place, trained, seconds)
+                steps_before += (place.stop - place.start) * members.steps
+                for activity, spent in trained.seconds.items() if trained else ():
+                    seconds[activity] = seconds.get(activity, 0.0) + spent
+                _measure(results, plan, steps_before, seconds, time.perf_counter() - started)
+                if directory is not None:
+                    results.save(directory)
     except KeyboardInterrupt:
         results.run["complete"] = False
     return results
 
 
-def _blocks(
-    study: Study, algorithm: Algorithm | None, agents: Agent, plan: Plan, on_progress: Callable[[Progress], None]
-) -> Iterator[tuple[slice, TrainedBlock | None]]:
-    """Block after block, trained if the study trains; if not, progress counts scenarios."""
-    if algorithm is None:
-        for block in range(plan.blocks.count):
-            place = slice(block * plan.blocks.size, min((block + 1) * plan.blocks.size, plan.agents))
-            yield place, None
-            on_progress(Progress(block, place.stop, plan.agents, float("nan")))
-        return
-    looks = validation_keys(study)
-    validation = Validation(every=study.evaluation.validate_every, draws=study.evaluation.validation_draws)
-    for trained in population.train(
-        algorithm, agents, looks, validation=validation, blocks=plan.blocks, on_progress=on_progress
-    ):
-        yield trained.agents, trained
+def _report(
+    on_progress: Callable[[Progress], None], plan: Plan, algorithm: str, steps_before: int
+) -> Callable[[Progress], None]:
+    """News of one algorithm as news of the whole run."""
+    names = list(plan.blocks)
+    blocks_before = sum(plan.blocks[name].count for name in names[: names.index(algorithm)])
+
+    def report(news: Progress) -> None:
+        steps, of_steps = steps_before + news.steps, plan.total_steps or plan.agents
+        on_progress(replace(news, block=blocks_before + news.block, steps=steps, of_steps=of_steps))
+
+    return report
 
 
-def _finish(
-    results: Results,
-    algorithm: Algorithm | None,
-    agents: Agent,
-    keys: Any,
-    place: slice,
-    trained: TrainedBlock | None,
-    who: pd.DataFrame,
-    seconds: dict[str, float],
-) -> None:
-    """Judge a block, trained or not, and add it to the results."""
-    members = jax.tree.map(lambda leaf: leaf[place], agents)
-    rows = who.iloc[place].reset_index(drop=True)
-    weights: dict[str, Any] = {}
-    curves: dict[str, Any] = {}
-    if algorithm and trained:
-        weights = {"best": trained.best, "last": trained.last}
-        names = ("chunk_steps", "episode_length", "look_steps", "validation")
-        curves = {name: getattr(trained, name) for name in names}
-        rows = rows.assign(
-            steps=algorithm.total_steps,
-            diverged_at=trained.diverged_at,
-            best_step=trained.best_step,
-            best_validation=trained.best_score,
-        )
-    settings = results.study.evaluation
-    tick = time.perf_counter()
-    judgements = judge(algorithm, members, keys[place], weights, settings.baselines)
-    tock = time.perf_counter()
-    planned = judge_planners(members, keys[place, :-1], settings, [judged.lifetime for judged in judgements.values()])
-    seconds["evaluate"] += tock - tick
-    seconds["plan"] += time.perf_counter() - tock
-    columns = {name: values for policy, judged in judgements.items() for name, values in judged.columns(policy).items()}
-    columns |= planned_columns(judgements, planned)
-    everyone: dict[str, Judgement | PlannedJudgement] = {**judgements, **planned}
-    evaluation = {
-        f"{policy.replace('-', '_')}/{name}": values
-        for policy, anyone in everyone.items()
-        for name, values in asdict(anyone).items()
-        if values is not None
-    }
-    results.add(rows.assign(**columns), curves, evaluation, weights)
+@dataclass(frozen=True)
+class _Population:
+    """The agents of one algorithm of a study, or those that nothing trains."""
+
+    study: Study
+    algorithm: Algorithm | None
+    agents: Agent
+    keys: Any
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of one agent."""
+        return self.algorithm.total_steps if self.algorithm else 0
+
+    def blocks(
+        self, cut: Blocks, on_progress: Callable[[Progress], None]
+    ) -> Iterator[tuple[slice, TrainedBlock | None]]:
+        """Block after block, trained if the study trains; if not, progress counts scenarios."""
+        if self.algorithm is None:
+            n = self.keys.shape[0]
+            for block in range(cut.count):
+                place = slice(block * cut.size, min((block + 1) * cut.size, n))
+                yield place, None
+                on_progress(Progress(block, place.stop, n, float("nan")))
+            return
+        settings = self.study.evaluation
+        validation = Validation(every=settings.validate_every, draws=settings.validation_draws)
+        for trained in population.train(
+            self.algorithm,
+            self.agents,
+            validation_keys(self.study),
+            validation=validation,
+            blocks=cut,
+            on_progress=on_progress,
+        ):
+            yield trained.agents, trained
+
+    def finish(self, results: Results, place: slice, trained: TrainedBlock | None, seconds: dict[str, float]) -> None:
+        """Judge a block, trained or not, and add it to the results."""
+        members, keys = jax.tree.map(lambda leaf: leaf[place], (self.agents, self.keys))
+        rows = pd.DataFrame(identities(self.study)[place])
+        weights: dict[str, Any] = {}
+        curves: dict[str, Any] = {}
+        learned: dict[str, Judgement] = {}
+        distinct = Distinct.of(rows[[name for name in rows if name in _WHAT_IS_PLAYED]])
+        if "algorithm" in results.study.axes:
+            rows.insert(3, "algorithm", self.study.algorithm)
+        tick = time.perf_counter()
+        if self.algorithm and trained:
+            weights = {"best": trained.best, "last": trained.last}
+            names = ("chunk_steps", "episode_length", "look_steps", "validation")
+            curves = {name: getattr(trained, name) for name in names}
+            rows = rows.assign(
+                steps=self.steps,
+                diverged_at=trained.diverged_at,
+                best_step=trained.best_step,
+                best_validation=trained.best_score,
+            )
+            learned = judge_learned(self.algorithm, members, keys, weights)
+        columns, evaluation = judge_all(members, keys, learned, distinct, self.study.evaluation, seconds, tick)
+        results.add(self.study.algorithm, rows.assign(**columns), curves, evaluation, weights)
+
+
+_WHAT_IS_PLAYED = ("seed", "powered", "connected", *TRACED_PARAMS)
+"""Columns that say what an agent plays; all others say how it learns."""
 
 
 def _label(study: Study, plan: Plan, command: str | None) -> dict[str, Any]:
@@ -206,20 +255,19 @@ def _label(study: Study, plan: Plan, command: str | None) -> dict[str, Any]:
         "complete": False,
         "agents": plan.agents,
         "seeds": seeds_of(study),
-        "blocks": asdict(plan.blocks),
+        "blocks": {name: asdict(blocks) for name, blocks in plan.blocks.items()},
         **host.describe(),
     }
 
 
-def _measure(results: Results, algorithm: Algorithm | None, plan: Plan, seconds: dict[str, float], wall: float) -> None:
+def _measure(results: Results, plan: Plan, steps: int, seconds: dict[str, float], wall: float) -> None:
     done = len(results.agents)
     results.run |= {
         "complete": done == plan.agents,
         "agents_done": done,
         "seconds": {name: round(spent, 2) for name, spent in seconds.items()} | {"wall": round(wall, 2)},
     }
-    if algorithm is not None:
-        steps = done * algorithm.total_steps
+    if steps:
         results.run |= {
             "diverged": int((results.agents["diverged_at"] >= 0).sum()),
             "environment_steps": steps,

@@ -1,7 +1,7 @@
 """Study files: what may stand in one, and one clear line for whatever may not.
 
-The numbers of Table 1 and the hyperparameters are declared once, as pytrees (:class:`Params`, :class:`DQNHyper`,
-:class:`DQNSpec`); the checks of a study file are made from those declarations.
+The numbers of Table 1 and the hyperparameters are declared once (:class:`Params`, :data:`ALGORITHMS`); the checks of a
+study file are made from those declarations.
 """
 
 import dataclasses
@@ -10,17 +10,24 @@ from typing import Annotated, Any, Literal, get_args
 import pydantic
 from pydantic import Field
 
-from uavmec_jax.learning.dqn import DQNHyper, DQNSpec
+from uavmec_jax.learning.registry import ALGORITHMS, OF_THE_SCENARIO
 from uavmec_jax.planning.beam import WIDTH as BEAM_WIDTH
 from uavmec_jax.planning.lookahead import SAMPLES as ROLLOUT_SAMPLES
 from uavmec_jax.world.params import Params
 from uavmec_jax.world.rewards import DEFAULT_REWARD, LOG_GUARDS, REWARDS, TERMS
 from uavmec_jax.world.settings import ParamsSettings, Strict, check_ranges, nearest, settings_model, wanted
 
-DQNSettings: Any = settings_model("DQNSettings", DQNHyper, DQNSpec, leave_out=("total_steps", "n_devices", "max_age"))
 
-TRACED = tuple(field.name for field in dataclasses.fields(DQNHyper))
-"""Hyperparameters that may be axes of a study."""
+def _algorithm_settings(name: str) -> Any:
+    declared = ALGORITHMS[name]
+    return settings_model(f"{name.upper()}Settings", declared.hyper, declared.spec, leave_out=OF_THE_SCENARIO)
+
+
+DQNSettings: Any = _algorithm_settings("dqn")
+PPOSettings: Any = _algorithm_settings("ppo")
+A2CSettings: Any = _algorithm_settings("a2c")
+
+AlgorithmName = Literal["dqn", "ppo", "a2c"]
 
 TRACED_PARAMS = tuple(field.name for field in dataclasses.fields(Params) if isinstance(field.default, int | float))
 TRACED_PARAMS = tuple(name for name in TRACED_PARAMS if name != "n_devices")
@@ -65,23 +72,35 @@ class Study(Strict):
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=80)] = "study"
     description: str = ""
-    algorithm: Literal["dqn", "none"] = "dqn"
-    """``none`` trains nothing: heuristics and planners alone."""
+    algorithm: Literal[AlgorithmName, "none"] = "dqn"
+    """``none`` trains nothing: heuristics and planners alone. Several algorithms are an axis."""
     reward: str | dict[str, float] = DEFAULT_REWARD
     guard: Literal["clamp", "log1p"] = "clamp"
     steps: Annotated[int, Field(ge=1, le=2_000_000_000)] = 1_000_000
     """Environment steps of one agent."""
     axes: dict[str, Any]
-    """``powered``, ``connected``, ``seeds`` (a number or a list), ``reward``, ``guard``, any traced setting."""
+    """``powered`` and ``connected``, or ``cells`` (pairs of the two); ``seeds`` (a number or a list); ``algorithm``,
+    ``reward``, ``guard``, any traced setting."""
     dqn: DQNSettings = DQNSettings()
+    ppo: PPOSettings = PPOSettings()
+    a2c: A2CSettings = A2CSettings()
     params: ParamsSettings = ParamsSettings()
     evaluation: Evaluation = Evaluation()
+
+    @property
+    def algorithms(self) -> tuple[str, ...]:
+        """Names of the algorithms that it trains."""
+        if self.algorithm == "none":
+            return ()
+        named = self.axes.get("algorithm", [self.algorithm])
+        return tuple(name for name in ALGORITHMS if isinstance(named, list) and name in named)
 
     @pydantic.model_validator(mode="after")
     def _check(self) -> "Study":
         _check_reward("reward", self.reward)
         _check_axes(self)
         check_ranges(self.params, "params.")
+        _check_algorithms(self)
         if self.algorithm == "none" and not self.evaluation.baselines + self.evaluation.planners:
             raise ValueError("algorithm is 'none' and evaluation has neither baselines nor planners; name one to judge")
         return self
@@ -97,16 +116,48 @@ def _check_reward(where: str, reward: Any) -> None:
                 raise ValueError(f"{where} has the term {term!r}, which is not one; {nearest(term, TERMS)}")
 
 
+def _check_algorithms(study: Study) -> None:
+    """Settings stand where they have an effect, and fit together."""
+    for name in ALGORITHMS:
+        if name in study.model_fields_set and name not in study.algorithms and study.algorithms:
+            raise ValueError(f"{name} has settings, but the study trains {', '.join(study.algorithms)}; leave them out")
+    for name in study.algorithms:
+        try:
+            ALGORITHMS[name].make(
+                getattr(study, name).model_dump(), total_steps=1, n_devices=study.params.n_devices, max_age=1
+            )
+        except ValueError as error:
+            raise ValueError(f"{name}.{error}") from None
+
+
+def traced(study: Study) -> tuple[str, ...]:
+    """Hyperparameters that may be axes of a study: those that all its algorithms have."""
+    shared = [ALGORITHMS[name].traced for name in study.algorithms] or [ALGORITHMS["dqn"].traced]
+    return tuple(name for name in shared[0] if all(name in others for others in shared))
+
+
+def _check_known(study: Study, name: str) -> None:
+    known = ("powered", "connected", "cells", "seeds", "algorithm", "reward", "guard", *traced(study), *TRACED_PARAMS)
+    if name in known:
+        return
+    for algorithm in study.algorithms:
+        everywhere = {traced for declared in ALGORITHMS.values() for traced in declared.traced}
+        if name in everywhere - set(ALGORITHMS[algorithm].traced):
+            has = ", ".join(ALGORITHMS[algorithm].traced)
+            raise ValueError(f"axes.{name} is not a hyperparameter of {algorithm}, which has {has}")
+    raise ValueError(f"axes.{name} is not an axis; {nearest(name, known)}")
+
+
 def _check_axes(study: Study) -> None:
     """Every axis is known, not empty, without repeats, and its values would be valid settings themselves."""
-    known = ("powered", "connected", "seeds", "reward", "guard", *TRACED, *TRACED_PARAMS)
-    for name in ("powered", "connected", "seeds"):
+    if "cells" in study.axes and {"powered", "connected"} & set(study.axes):
+        raise ValueError("axes.cells stands beside axes.powered or axes.connected; give the pairs or the two lists")
+    for name in ("seeds",) if "cells" in study.axes else ("powered", "connected", "seeds"):
         if name not in study.axes:
             raise ValueError(f"axes.{name} is missing; give a list of whole numbers")
     for name, values in study.axes.items():
         where = f"axes.{name}"
-        if name not in known:
-            raise ValueError(f"{where} is not an axis; {nearest(name, known)}")
+        _check_known(study, name)
         if name == "seeds" and isinstance(values, int) and not isinstance(values, bool):
             if not 1 <= values < 2**31:
                 raise ValueError(f"{where} is {values}; give at least 1 seed, and fewer than 2**31")
@@ -117,7 +168,7 @@ def _check_axes(study: Study) -> None:
             raise ValueError(f"{where} is empty; give at least one value")
         for value in values:
             _check_value(study, name, where, value)
-        if len(set(values)) < len(values):
+        if any(value in values[:place] for place, value in enumerate(values)):
             raise ValueError(f"{where} repeats a value: {values}")
 
 
@@ -127,6 +178,16 @@ def _check_value(study: Study, name: str, where: str, value: Any) -> None:
     if name in ("powered", "connected"):
         if not whole or not 0 <= value <= n:
             raise ValueError(f"{where} has {value!r}; give whole numbers from 0 to {n}, the number of devices")
+    elif name == "cells":
+        if not isinstance(value, list) or len(value) != 2:
+            raise ValueError(f"{where} has {value!r}; give pairs [powered, connected]")
+        for part in value:
+            _check_value(study, "powered", where, part)
+    elif name == "algorithm":
+        if study.algorithm == "none":
+            raise ValueError(f"{where} is given, but algorithm is 'none'; leave one of them out")
+        if value not in ALGORITHMS:
+            raise ValueError(f"{where} has {value!r}; known: {', '.join(ALGORITHMS)}")
     elif name == "seeds":
         if not whole or not 0 <= value < 2**31:
             raise ValueError(f"{where} has {value!r}; give whole numbers from 0 to 2147483647")
@@ -136,8 +197,9 @@ def _check_value(study: Study, name: str, where: str, value: Any) -> None:
         if value not in LOG_GUARDS:
             raise ValueError(f"{where} has {value!r}; {nearest(str(value), LOG_GUARDS)}")
     else:
-        settings = DQNSettings if name in TRACED else ParamsSettings
-        try:
-            settings(**{name: value})
-        except pydantic.ValidationError as error:
-            raise ValueError(f"{where} has {value!r}; {wanted(error.errors()[0])}") from None
+        own = [type(getattr(study, algorithm)) for algorithm in study.algorithms or ("dqn",)]
+        for settings in own if name in traced(study) else [ParamsSettings]:
+            try:
+                settings(**{name: value})
+            except pydantic.ValidationError as error:
+                raise ValueError(f"{where} has {value!r}; {wanted(error.errors()[0])}") from None

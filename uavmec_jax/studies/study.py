@@ -1,6 +1,5 @@
 """Studies: read, check and change study files, and make the population that a study describes."""
 
-import dataclasses
 import itertools
 import math
 import tomllib
@@ -16,13 +15,13 @@ import pydantic
 import tomli_w
 
 from uavmec_jax.errors import StudyError
-from uavmec_jax.learning import dqn
 from uavmec_jax.learning.algorithm import Agent, Algorithm
-from uavmec_jax.studies.schema import TRACED, Study
+from uavmec_jax.learning.registry import ALGORITHMS
+from uavmec_jax.studies.schema import Study
 from uavmec_jax.world.environment import Scenario
 from uavmec_jax.world.layout import Layout, sample_layout
 from uavmec_jax.world.params import Params
-from uavmec_jax.world.rewards import make_reward
+from uavmec_jax.world.rewards import Reward, make_reward, needs_guard
 from uavmec_jax.world.settings import nearest, one_line, tuples
 
 # Streams of randomness: the seed of the root key. An agent's share of each hangs on its identity.
@@ -89,13 +88,14 @@ def parse_study(text: str, source: str, overrides: Mapping[str, Any] | None = No
 
 def _listed(data: dict[str, Any]) -> dict[str, Any]:
     """TOML arrays as tuples where a setting is a tuple (the checks do not convert)."""
-    settings = ("dqn", "params", "evaluation")
+    settings = (*ALGORITHMS, "params", "evaluation")
     return {key: tuples(value) if key in settings and isinstance(value, dict) else value for key, value in data.items()}
 
 
 def study_toml(study: Study) -> str:
     """The study, every setting resolved, as TOML that :func:`load_study` reads back to an equal study."""
-    return tomli_w.dumps(study.model_dump(mode="json") | {"params": _finite(study.params.model_dump())})
+    silent = set(ALGORITHMS) - set(study.algorithms)
+    return tomli_w.dumps(study.model_dump(mode="json", exclude=silent) | {"params": _finite(study.params.model_dump())})
 
 
 def _finite(params: dict[str, Any]) -> dict[str, Any]:
@@ -111,47 +111,84 @@ def seeds_of(study: Study) -> list[int]:
 
 def cell_axes(study: Study) -> list[str]:
     """The axes that make a cell: all but the seeds, ``powered`` and ``connected`` first."""
-    others = [name for name in study.axes if name not in ("powered", "connected", "seeds")]
+    others = [name for name in study.axes if name not in ("powered", "connected", "cells", "seeds")]
     return ["powered", "connected", *others]
 
 
+def parts(study: Study) -> list[Study]:
+    """The study cut into studies of one algorithm each, in the order in which they are run."""
+    if "algorithm" not in study.axes:
+        return [study]
+    axes = {name: values for name, values in study.axes.items() if name != "algorithm"}
+    return [study.model_copy(update={"algorithm": name, "axes": axes}) for name in study.axes["algorithm"]]
+
+
 def identities(study: Study) -> list[dict[str, Any]]:
-    """One dictionary per agent: its value on every axis. Seeds outermost, so that early blocks hold whole grids."""
-    names = ["seed", *cell_axes(study)]
-    axes: list[Iterable[Any]] = [seeds_of(study), *(study.axes[name] for name in names[1:])]
-    return [dict(zip(names, values, strict=True)) for values in itertools.product(*axes)]
+    """One dictionary per agent: its value on every axis. Algorithms outermost, then seeds: early blocks hold whole grids.
+
+    A reward without ``log A`` and ``log O`` is the same under every guard and stands there once, under the first.
+    """
+    if "algorithm" in study.axes:
+        order = ["seed", *cell_axes(study)]
+        everyone = [who | {"algorithm": part.algorithm} for part in parts(study) for who in identities(part)]
+        return [{name: who[name] for name in order} for who in everyone]
+    names = ["seed", "cell", *cell_axes(study)[2:]]
+    axes: list[Iterable[Any]] = [seeds_of(study), _cells(study), *(study.axes[name] for name in names[2:])]
+    everyone = [dict(zip(names, values, strict=True)) for values in itertools.product(*axes)]
+    return [
+        {"seed": who["seed"], "powered": who["cell"][0], "connected": who["cell"][1]}
+        | {name: who[name] for name in names[2:]}
+        for who in everyone
+        if _says_something(study, who)
+    ]
+
+
+def _cells(study: Study) -> list[tuple[int, int]]:
+    """Pairs of powered and connected devices."""
+    if "cells" in study.axes:
+        return [(powered, connected) for powered, connected in study.axes["cells"]]
+    return list(itertools.product(study.axes["powered"], study.axes["connected"]))
+
+
+def _says_something(study: Study, who: Mapping[str, Any]) -> bool:
+    """Whether an agent is not the same under an earlier guard."""
+    if "guard" not in study.axes or who["guard"] == study.axes["guard"][0]:
+        return True
+    return needs_guard(who.get("reward", study.reward))
 
 
 def n_agents(study: Study) -> int:
     """Size of the population, without making it."""
-    lengths = [len(values) for values in study.axes.values() if isinstance(values, list)]
+    others = [values for name, values in study.axes.items() if name not in ("seeds", "reward", "guard")]
+    rewards, guards = study.axes.get("reward", [study.reward]), study.axes.get("guard", [study.guard])
+    pairs = sum(len(guards) if needs_guard(reward) else 1 for reward in rewards)
     seeds = study.axes["seeds"]
-    return math.prod(lengths) * (seeds if isinstance(seeds, int) else 1)
+    return math.prod(len(values) for values in others) * pairs * (seeds if isinstance(seeds, int) else len(seeds))
 
 
 def make_algorithm(study: Study) -> Algorithm | None:
-    """The study's algorithm with its static settings; ``None`` if the study trains nothing."""
+    """The algorithm of a study of one (see :func:`parts`) with its static settings; ``None`` if nothing is trained."""
     if study.algorithm == "none":
         return None
-    names = {field.name for field in dataclasses.fields(dqn.DQNSpec)}
-    settings = {name: value for name, value in study.dqn.model_dump().items() if name in names}
     limits = study.axes.get("data_age_limit_slots", [study.params.data_age_limit_slots])
-    return dqn.algorithm(
-        dqn.DQNSpec(
-            total_steps=study.steps,
-            n_devices=study.params.n_devices,
-            max_age=max(limits) + 1,
-            **settings,
-        )
+    return ALGORITHMS[study.algorithm].make(
+        getattr(study, study.algorithm).model_dump(),
+        total_steps=study.steps,
+        n_devices=study.params.n_devices,
+        max_age=max(limits) + 1,
     )
 
 
-def make_agents(study: Study) -> Agent:
-    """The population, leaves ``[A, ...]``, in the order of :func:`identities`.
+def make_agents(study: Study, reward: Reward | None = None) -> Agent:
+    """The population of a study of one algorithm, leaves ``[A, ...]``, in the order of :func:`identities`.
 
     What is random about an agent hangs on its seed and its counts of devices alone: layouts on the seed (the cells of
     one seed are the same town with less and less power and communication), exploration and weights on all three.
-    Hyperparameters and rewards are thus compared on equal ground.
+    Hyperparameters, rewards and algorithms are thus compared on equal ground.
+
+    Args:
+        study: of one algorithm, or of none.
+        reward: stands in for the study's reward, for all agents.
     """
     who = identities(study)
     seeds, powered, connected = (_column(who, name) for name in ("seed", "powered", "connected"))
@@ -168,13 +205,16 @@ def make_agents(study: Study) -> Agent:
     settings: dict[str, Any] = {name: spread(name, value) for name, value in study.params.model_dump().items()}
     params = Params(**settings)
     layout = jax.jit(jax.vmap(town))(seeds, params, powered, connected)
-    rewards = [make_reward(agent.get("reward", study.reward), agent.get("guard", study.guard)) for agent in who]
-    reward = jax.tree.map(lambda *leaves: jnp.stack(leaves), *rewards)
-    hyper = dqn.DQNHyper(**{name: leaf(name, getattr(study.dqn, name)) for name in TRACED})
+    named = [(agent.get("reward", study.reward), agent.get("guard", study.guard)) for agent in who]
+    rewards = [make_reward(*pair) for pair in named] if reward is None else [reward] * len(who)
+    declared = ALGORITHMS["dqn" if study.algorithm == "none" else study.algorithm]
+    own = getattr(study, "dqn" if study.algorithm == "none" else study.algorithm)
     return Agent(
         key=_agent_keys(_TRAINING, seeds, powered, connected),
-        scenario=Scenario(params=params, layout=layout, reward=reward),
-        hyper=hyper,
+        scenario=Scenario(
+            params=params, layout=layout, reward=jax.tree.map(lambda *leaves: jnp.stack(leaves), *rewards)
+        ),
+        hyper=declared.hyper(**{name: leaf(name, getattr(own, name)) for name in declared.traced}),
     )
 
 

@@ -1,9 +1,10 @@
 """Rewards: weight vectors over eight terms; the eleven of Table 6 by name (paper, section 3.2 and Table 6)."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -65,32 +66,61 @@ REWARDS: Mapping[str, np.ndarray] = MappingProxyType(
 
 @struct.dataclass
 class Reward:
-    """A linear reward.
+    """A reward: linear in the terms, or any function of them.
 
     Attributes:
         weights: ``[8]`` over :data:`TERMS`.
         log1p: bool; the guard of the logarithms, see :data:`LOG_GUARDS`.
+        function: ``None``, or what makes a scalar from ``{term: scalar}`` in place of the weights; static.
     """
 
     weights: Any
     log1p: Any = False
+    function: Callable[[Mapping[str, Any]], Any] | None = struct.field(pytree_node=False, default=None)
 
 
-def make_reward(reward: str | Mapping[str, float] = DEFAULT_REWARD, guard: str = "clamp") -> Reward:
-    """Return a :class:`Reward` from a name of Table 6 or from weights of one's own.
+def make_reward(
+    reward: str | Mapping[str, float] | Callable[[Mapping[str, Any]], Any] = DEFAULT_REWARD, guard: str = "clamp"
+) -> Reward:
+    """Return a :class:`Reward` from a name of Table 6, from weights of one's own, or from a function.
+
+    Args:
+        reward: ``"U+log(A/O)"``; or ``{"U": 1.0, "log A": 1.0}``; or a function of a mapping from :data:`TERMS` to
+            scalars that returns a scalar and can be traced, e.g. ``lambda terms: terms["U"] * terms["M"]``.
+        guard: one of :data:`LOG_GUARDS`.
 
     Raises:
-        ValueError: unknown name, term or guard.
+        ValueError: unknown name, term or guard; or the function does not return a scalar.
     """
     if guard not in LOG_GUARDS:
         raise ValueError(f"unknown log guard {guard!r}; guards are {', '.join(LOG_GUARDS)}")
+    log1p = jnp.asarray(guard == "log1p")
+    if callable(reward):
+        _check_function(reward)
+        return Reward(weights=jnp.zeros(len(TERMS)), log1p=log1p, function=reward)
     if isinstance(reward, str):
         if reward not in REWARDS:
             raise ValueError(f"unknown reward {reward!r}; rewards are {', '.join(REWARDS)}")
         weights = REWARDS[reward]
     else:
         weights = make_weights(reward)
-    return Reward(weights=jnp.asarray(weights), log1p=jnp.asarray(guard == "log1p"))
+    return Reward(weights=jnp.asarray(weights), log1p=log1p)
+
+
+def _check_function(function: Callable[[Mapping[str, Any]], Any]) -> None:
+    scalar = jax.ShapeDtypeStruct((), jnp.float32)
+    try:
+        made = jax.eval_shape(lambda terms: jnp.asarray(function(terms)), dict.fromkeys(TERMS, scalar))
+    except KeyError as error:
+        raise ValueError(f"the reward function asks for the term {error}; terms are {', '.join(TERMS)}") from None
+    if made.shape != ():
+        raise ValueError(f"the reward function returns an array of shape {made.shape}; it should return a scalar")
+
+
+def needs_guard(reward: str | Mapping[str, float]) -> bool:
+    """Whether the guard makes a difference: it does to ``log A`` and ``log O`` alone."""
+    weights = REWARDS[reward] if isinstance(reward, str) else make_weights(reward)
+    return bool(weights[TERMS.index("log A")] or weights[TERMS.index("log O")])
 
 
 def reward_terms(
@@ -111,4 +141,7 @@ def reward_of(
     reward: Reward, layout: Layout, before: State, action: Int[ArrayLike, ""], after: State
 ) -> Float[Array, ""]:
     """The scalar reward of one slot."""
-    return jnp.dot(reward.weights, reward_terms(layout, before, action, after, reward.log1p))
+    terms = reward_terms(layout, before, action, after, reward.log1p)
+    if reward.function is not None:
+        return jnp.asarray(reward.function(dict(zip(TERMS, terms, strict=True))), jnp.float32)
+    return jnp.dot(reward.weights, terms)
