@@ -125,14 +125,13 @@ def sb3_worker(seconds: float) -> None:
     os.environ["JAX_PLATFORMS"] = "cpu"
     import numpy as np
     import torch
-    from gymnasium_adapter import SingleScenario
     from stable_baselines3 import DQN
 
-    from uavmec_jax.world.environment import make_scenario
+    from uavmec_jax.interop.gymnasium_env import UavMecGymEnv
 
     torch.set_num_threads(1)  # faster than several for nets this small
     model = DQN(
-        "MlpPolicy", SingleScenario(make_scenario()), learning_rate=0.0071, batch_size=16, gamma=0.98,
+        "MlpPolicy", UavMecGymEnv(), learning_rate=0.0071, batch_size=16, gamma=0.98,
         buffer_size=2 * FILLED, exploration_fraction=0.35, policy_kwargs={"net_arch": [64, 64]}, device="cpu", seed=0,
     )  # fmt: skip
     model.learn(2000)

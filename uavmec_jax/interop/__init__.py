@@ -1,5 +1,15 @@
-"""The environment for other people's learners; importing this registers ``UavMec-v0`` with Gymnasium."""
+"""The environment for other people's learners; importing this registers ``UavMec-v0`` with Gymnasium.
 
-from uavmec_jax.interop.registration import register
+``gymnasium.make("uavmec_jax.interop:UavMec-v0")`` does both at once.
+"""
 
-register()
+import gymnasium
+
+ENV_ID = "UavMec-v0"
+
+if ENV_ID not in gymnasium.registry:
+    gymnasium.register(
+        ENV_ID,
+        entry_point="uavmec_jax.interop.gymnasium_env:UavMecGymEnv",
+        vector_entry_point="uavmec_jax.interop.vector_env:UavMecVectorEnv",
+    )

@@ -1,7 +1,7 @@
 """One scenario as a Gymnasium environment, for learners that step one environment from Python."""
 
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import jax
@@ -24,11 +24,11 @@ class UavMecGymEnv(gymnasium.Env):
     """The environment on one layout.
 
     ``reset(seed=...)`` seeds the task volumes, the only thing that is random. ``info`` holds ``cause`` (``"none"``,
-    ``"battery"``, ``"data_age"``, ``"uav"``), ``failed`` and ``served`` (device numbers from 0), ``first_failure`` ``[n]``,
+    ``"battery"``, ``"data_age"``, ``"uav"``), ``failed`` and ``served`` (``[n]`` bool), ``first_failure`` (``[n]``, shares),
     ``duration`` (s) and ``length`` (slots of the episode so far).
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 2}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012
 
     def __init__(self, scenario: Scenario | None = None, render_mode: str | None = None) -> None:
         """Bind a scenario.
@@ -68,8 +68,8 @@ class UavMecGymEnv(gymnasium.Env):
         failed, served, first_failure = numbers[5 + 2 * n :].reshape(3, n)
         info = {
             "cause": Cause(int(numbers[1])).name.lower(),
-            "failed": np.flatnonzero(failed),
-            "served": np.flatnonzero(served),
+            "failed": failed > 0,
+            "served": served > 0,
             "first_failure": first_failure,
             "duration": float(numbers[3]),
             "length": int(numbers[4]),

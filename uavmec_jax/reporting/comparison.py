@@ -29,42 +29,47 @@ def label_rewards(cells: pd.DataFrame) -> list[str]:
 
 
 def comparison_tables(cells: pd.DataFrame) -> dict[str, Table]:
-    """The paper's table for the best and for the last weights."""
-    below = "below: maximum over the seeds / the paper's maximum"
+    """The paper's table, one for each of its columns of cells, and those who learn nothing."""
     guard = f"; logarithms guarded by {cells['guard'].iloc[0]} where nothing else is said" if "guard" in cells else ""
+    how = f"best weights: mean over the seeds ± 95 %, maximum / the paper's maximum; below: last weights{guard}"
+    places = dict.fromkeys(zip(cells.powered, cells.connected, strict=True))
     return {
-        f"Lifetime in slots, `{name}` weights, mean over the seeds ± 95 %; {below}{guard}": comparison_table(
-            cells, name
+        f"{powered} powered, {connected} connected: lifetime in slots, {how}": comparison_table(
+            cells[(cells.powered == powered) & (cells.connected == connected)]
         )
-        for name in ("best", "last")
+        for powered, connected in places
     } | {"Lifetime in slots of those who learn nothing, on the same layouts": _others(cells)}
 
 
-def comparison_table(cells: pd.DataFrame, policy: str) -> Table:
-    """Rows: rewards. Columns: cells, and in them the algorithms. The best mean of each column is bold."""
+def comparison_table(cells: pd.DataFrame) -> Table:
+    """One place of Table 6: rewards down, algorithms across. The best mean of each algorithm is bold."""
     cells = cells.assign(reward_shown=label_rewards(cells))
-    places = list(dict.fromkeys(zip(cells.powered, cells.connected, strict=True)))
-    columns = [(*place, algorithm) for place in places for algorithm in dict.fromkeys(cells["algorithm"])]
+    algorithms = list(dict.fromkeys(cells["algorithm"]))
     table = Table()
-    table.add_column("reward", no_wrap=True)
-    for powered, connected, algorithm in columns:
-        table.add_column(f"{powered}/{connected}\n{ALGORITHM_NAMES[algorithm]}", justify="right", no_wrap=True)
-    keyed = cells.set_index(["powered", "connected", "algorithm", "reward_shown"])
-    highest = {column: keyed.loc[column][policy].max() for column in columns}
+    table.add_column("reward")
+    for algorithm in algorithms:
+        table.add_column(ALGORITHM_NAMES[algorithm], justify="right", no_wrap=True)
+    keyed: Any = cells.set_index(["algorithm", "reward_shown"], drop=False)
+    highest = {algorithm: keyed.loc[algorithm]["best"].max() for algorithm in algorithms}
     for shown in dict.fromkeys(cells["reward_shown"]):
-        found = [keyed.loc[(*column, shown)] for column in columns]
-        texts = [_entry(cell, column, policy, highest[column]) for cell, column in zip(found, columns, strict=True)]
-        table.add_row(shown, *texts)
+        found = [keyed.loc[(algorithm, shown)] for algorithm in algorithms]
+        table.add_row(shown, *(_entry(cell, highest[cell["algorithm"]]) for cell in found))
     return table
 
 
-def _entry(cell: Any, column: tuple[int, int, str], policy: str, highest: float) -> Text:
-    paper = TABLE6.get((cell["reward"], *column))
-    half = (cell[f"{policy}_high"] - cell[f"{policy}_low"]) / 2
-    text = Text(f"{cell[policy]:.1f}", style="bold" if cell[policy] == highest else "default")
-    text.append(f" ±{half:.1f}" if half == half else " ±?", style="dim not bold")
-    text.append(f"\n{cell[f'{policy}_max']:.1f}", style="not bold")
-    return text.append(f" / {paper:g}" if paper is not None else " / -", style="dim not bold")
+def _entry(cell: Any, highest: float) -> Text:
+    paper = TABLE6.get((cell["reward"], cell["powered"], cell["connected"], cell["algorithm"]))
+    text = Text(f"{cell['best']:.1f}", style="bold" if cell["best"] == highest else "default")
+    text.append(half_interval(cell["best_low"], cell["best_high"]), style="dim not bold")
+    text.append(f", {cell['best_max']:.1f}", style="not bold")
+    text.append(f" / {paper:g}" if paper is not None else " / -", style="not bold")
+    text.append(f"\n{cell['last']:.1f}", style="dim not bold")
+    return text.append(half_interval(cell["last_low"], cell["last_high"]), style="dim not bold")
+
+
+def half_interval(low: float, high: float) -> str:
+    """Half an interval as ±; ±? where there is none."""
+    return f" ±{(high - low) / 2:.1f}" if high == high else " ±?"
 
 
 def _others(cells: pd.DataFrame) -> Table:

@@ -8,19 +8,8 @@ from matplotlib.figure import Figure
 
 from uavmec_jax.planning.outlook import Outlook
 from uavmec_jax.reporting.figures import new_figure
+from uavmec_jax.reporting.map_figure import draw_devices
 
-_COLOURS = {
-    (True, True): "tab:green",
-    (True, False): "tab:blue",
-    (False, True): "tab:orange",
-    (False, False): "tab:red",
-}
-_LACKS = {
-    (True, True): "has both",
-    (True, False): "no comms",
-    (False, True): "no power",
-    (False, False): "has neither",
-}
 _TITLES = {"rollout": "rollout planner", "beam": "beam (clairvoyant)"}
 
 
@@ -51,18 +40,11 @@ def _map(axis: Axes, outlook: Outlook, action: np.ndarray, title: str) -> None:
     stops = np.concatenate([np.zeros((1, 2)), layout.position[action]])
     axis.plot(stops[:, 0], stops[:, 1], color="0.6", lw=1.0, zorder=1)
     axis.plot(0, 0, marker="s", color="black", ls="", label="start")
-    for (power, comms), colour in _COLOURS.items():
-        these = (layout.has_power == power) & (layout.has_comms == comms)
-        x, y = layout.position[these].T
-        axis.scatter(x, y, s=90, color=colour, label=_LACKS[power, comms], zorder=2)
+    draw_devices(axis, layout)
     for device, (x, y) in enumerate(layout.position):
         visits = int(np.sum(action == device))
-        axis.annotate(f"{device + 1}", (x, y), ha="center", va="center", fontsize=7, color="white", zorder=3)
         axis.annotate(f"{visits}x", (x, y), xytext=(7, 5), textcoords="offset points", fontsize=7)
-    axis.set_aspect("equal", adjustable="datalim")
     axis.set_title(title, fontsize=10)
-    axis.set_xlabel("m east")
-    axis.set_ylabel("m north")
     axis.legend(fontsize=7, loc="best")
 
 

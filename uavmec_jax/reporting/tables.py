@@ -6,7 +6,7 @@ import pandas as pd
 from rich.table import Table
 from rich.text import Text
 
-from uavmec_jax.reporting.comparison import comparison_tables, is_comparison
+from uavmec_jax.reporting.comparison import comparison_tables, half_interval, is_comparison
 from uavmec_jax.studies.paper import TABLE5
 from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.study import cell_axes
@@ -81,7 +81,7 @@ def grid_table(results: Results, cells: pd.DataFrame, policy: str) -> Table:
 def _lifetime(cell: Any, policy: str, baseline: str | None) -> Text:
     paper = TABLE5.get((cell["powered"], cell["connected"]))
     text = Text(f"{cell[policy]:.1f}", style=_style(cell[policy], paper))
-    text.append(_half(cell[f"{policy}_low"], cell[f"{policy}_high"]), style="dim")
+    text.append(half_interval(cell[f"{policy}_low"], cell[f"{policy}_high"]), style="dim")
     text.append(f"\n{paper:g}" if paper is not None else "\n-", style="not bold default")
     if baseline:
         text.append(f" / {cell[baseline]:.1f}", style="not bold default")
@@ -100,14 +100,9 @@ def paired_table(cells: pd.DataFrame) -> Table:
     def difference(cell: Any, policy: str) -> Text:
         mean, low, high = (cell[f"{policy}_over_oldest{part}"] for part in ("", "_low", "_high"))
         style = "green" if low > 0 else "red" if high < 0 else "default"
-        return Text(f"{mean:+.1f}", style=style).append(_half(low, high), style="dim")
+        return Text(f"{mean:+.1f}", style=style).append(half_interval(low, high), style="dim")
 
     return _grid(cells, lambda cell: difference(cell, "best").append("\n").append(difference(cell, "last")))
-
-
-def _half(low: float, high: float) -> str:
-    """Half an interval as ±; ±? where there is none."""
-    return f" ±{(high - low) / 2:.1f}" if high == high else " ±?"
 
 
 def failure_table(cells: pd.DataFrame, policy: str = "best") -> Table:
@@ -153,7 +148,9 @@ def list_table(results: Results, cells: pd.DataFrame) -> Table:
     for _, cell in cells.iterrows():
         lifetimes = []
         for policy in results.policies:
-            interval = _half(cell[f"{policy}_low"], cell[f"{policy}_high"]) if policy in ("best", "last") else ""
+            interval = (
+                half_interval(cell[f"{policy}_low"], cell[f"{policy}_high"]) if policy in ("best", "last") else ""
+            )
             lifetimes.append(f"{cell[policy]:.1f}{interval}")
         place = [value if isinstance(value := cell[name], str) else f"{value:g}" for name in (*axes, "seeds")]
         gaps = [f"{gap:+.1f}" for gap in gap_percent(results, cell).values()]

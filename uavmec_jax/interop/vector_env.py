@@ -1,0 +1,98 @@
+"""Many scenarios as one Gymnasium vector environment: every step is one jitted call."""
+
+from functools import partial
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from uavmec_jax.interop.gymnasium_env import spaces
+from uavmec_jax.world.environment import Scenario, UavMecEnv, make_scenario
+from uavmec_jax.world.layout import sample_layout
+from uavmec_jax.world.params import Params
+from uavmec_jax.world.physics import Cause, State
+
+_CAUSES = np.array([cause.name.lower() for cause in Cause])
+
+
+class UavMecVectorEnv(VectorEnv):
+    """``N`` layouts stepped together; an episode that ends is restarted in the same step.
+
+    ``info`` holds arrays over the environments: ``cause`` ``[N]``, ``failed`` and ``served`` ``[N, n]`` bool,
+    ``first_failure`` ``[N, n]``, ``duration`` and ``length`` ``[N]``; and where episodes ended ``final_obs`` and
+    ``final_info``, with the mask ``_final_obs``, as Gymnasium's own vector environments have them.
+    """
+
+    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+
+    def __init__(self, num_envs: int = 1, scenario: Scenario | None = None) -> None:
+        """Bind scenarios.
+
+        Args:
+            num_envs: ``N``.
+            scenario: one for all environments, or one each (leaves ``[N, ...]``); by default the random layouts of the
+                keys 0 to N - 1 with 8 powered and 8 connected devices.
+
+        Raises:
+            ValueError: a batch of scenarios of another size.
+        """
+        self.num_envs = num_envs
+        self._scenario = _batched(num_envs, scenario)
+        self.single_observation_space, self.single_action_space = spaces(self._scenario)
+        self.observation_space: gymnasium.Space = batch_space(self.single_observation_space, num_envs)
+        self.action_space: gymnasium.Space = batch_space(self.single_action_space, num_envs)
+        self._env = UavMecEnv()
+        self._state: State | None = None
+        self._key, self._steps = jax.random.key(0), 0
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start an episode in every environment; ``seed`` seeds the task volumes of all."""
+        super().reset(seed=seed, options=options)
+        if seed is not None or self._state is None:
+            self._key, self._steps = jax.random.key(int(self.np_random.integers(2**32, dtype=np.uint32))), 0
+        observation, self._state = _reset(self._env, self._scenario)
+        return np.asarray(observation), {}
+
+    def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One slot in every environment; ``actions`` is ``[N]``."""
+        actions = jnp.asarray(actions, jnp.int32)
+        stepped = _step(self._env, self._scenario, self._key, np.uint32(self._steps), self._state, actions)
+        (observation, self._state, *told), self._steps = stepped, self._steps + 1
+        observation, (reward, terminated, truncated, info) = jax.device_get((observation, told))
+        final = info.pop("final_observation")
+        ended = info.pop("terminated") | info.pop("truncated")
+        info["cause"] = _CAUSES[info["cause"]]
+        if ended.any():
+            last = np.full(self.num_envs, None, dtype=object)
+            for place in np.flatnonzero(ended):
+                last[place] = final[place]
+            names = {f"_{name}": ended for name in info}
+            info |= {"final_obs": last, "_final_obs": ended, "final_info": dict(info) | names, "_final_info": ended}
+        return observation, reward, terminated, truncated, info
+
+
+def _batched(num_envs: int, scenario: Scenario | None) -> Scenario:
+    if scenario is None:
+        params = Params()
+        keys = jax.vmap(jax.random.key)(jnp.arange(num_envs))
+        return jax.vmap(lambda key: make_scenario(sample_layout(key, params, 8, 8), params))(keys)
+    if scenario.layout.capacity.ndim == 1:
+        return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num_envs, *jnp.shape(leaf))), scenario)
+    if scenario.layout.capacity.shape[0] != num_envs:
+        raise ValueError(f"scenario holds {scenario.layout.capacity.shape[0]} layouts; it should hold {num_envs}")
+    return scenario
+
+
+@partial(jax.jit, static_argnums=0)
+def _reset(env: UavMecEnv, scenario: Scenario) -> tuple[Any, State]:
+    return jax.vmap(lambda scenario: env.reset(jax.random.key(0), scenario))(scenario)
+
+
+@partial(jax.jit, static_argnums=0)
+def _step(env: UavMecEnv, scenario: Scenario, key: Any, number: Any, state: State, actions: Any) -> Any:
+    keys = jax.random.split(jax.random.fold_in(key, number), actions.shape[0])
+    return jax.vmap(env.step)(keys, state, actions, scenario)
