@@ -11,3 +11,7 @@ class StudyError(UserError):
 
 class LayoutError(UserError):
     """An inventory of devices is not usable."""
+
+
+class PolicyError(UserError):
+    """A saved policy, or what it is asked, is not usable."""

@@ -5,8 +5,12 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from flax import struct
+from jaxtyping import Array
 
-from uavmec_jax.world.environment import Scenario
+from uavmec_jax.world.environment import Scenario, observe
+from uavmec_jax.world.layout import Layout
+from uavmec_jax.world.params import Params
+from uavmec_jax.world.physics import State
 from uavmec_jax.world.rollout import Policy
 
 AGENTS_AXIS = "agents"
@@ -49,7 +53,7 @@ class Algorithm:
         init: ``(agent) -> state``.
         update: ``(agent, state, first, last) -> state``: the iterations ``first <= i < last``; the two bounds are
             shared by all agents and never batched. Runs under ``vmap(axis_name=AGENTS_AXIS)``.
-        policy: ``(hyper, weights) -> policy``.
+        greedy: ``(hyper, weights, observation [..., 2n]) -> action [...]`` int32, the best one in the eyes of the weights.
     """
 
     name: str
@@ -58,7 +62,15 @@ class Algorithm:
     agent_bytes: int
     init: Callable[[Agent], Any]
     update: Callable[[Agent, Any, Any, Any], Any]
-    policy: Callable[[Any, Any], Policy]
+    greedy: Callable[[Any, Any, Array], Array]
+
+    def policy(self, hyper: Any, weights: Any) -> Policy:
+        """The greedy policy of an agent; ties go to the lowest number. States may be batched."""
+
+        def act(params: Params, layout: Layout, state: State, key: Any = None) -> Array:
+            return self.greedy(hyper, weights, observe(layout, state))
+
+        return act
 
     @property
     def total_steps(self) -> int:

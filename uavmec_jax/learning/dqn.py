@@ -20,10 +20,7 @@ from uavmec_jax.learning.algorithm import AGENTS_AXIS, Agent, Algorithm
 from uavmec_jax.learning.networks import QNetwork, n_weights, scale_ages
 from uavmec_jax.learning.optimizers import Descent, clipped_adam, descend
 from uavmec_jax.world.environment import advance, draw_volumes, is_truncated, observe, restart_if
-from uavmec_jax.world.layout import Layout
-from uavmec_jax.world.params import Params
 from uavmec_jax.world.physics import Cause, State, initial_state
-from uavmec_jax.world.rollout import Policy
 
 _WEIGHTS_STREAM = 2**32 - 1
 """``fold_in`` number of the initial weights; the iterations use their own numbers, from 0."""
@@ -135,7 +132,7 @@ def algorithm(spec: DQNSpec) -> Algorithm:
         agent_bytes=spec.agent_bytes,
         init=partial(init, spec),
         update=partial(update, spec),
-        policy=partial(policy, spec),
+        greedy=partial(greedy, spec),
     )
 
 
@@ -193,13 +190,9 @@ def q_values(spec: DQNSpec, hyper: DQNHyper, weights: Any, observation: Float[Ar
     return values
 
 
-def policy(spec: DQNSpec, hyper: DQNHyper, weights: Any) -> Policy:
-    """The greedy policy of an agent: the action of the highest Q-value; ties go to the lowest number."""
-
-    def act(params: Params, layout: Layout, state: State, key: Any = None) -> Array:
-        return jnp.argmax(q_values(spec, hyper, weights, observe(layout, state))).astype(jnp.int32)
-
-    return act
+def greedy(spec: DQNSpec, hyper: DQNHyper, weights: Any, observation: Float[Array, "*b two_n"]) -> Int[Array, "*b"]:
+    """The action of the highest Q-value; ties go to the lowest number."""
+    return jnp.argmax(q_values(spec, hyper, weights, observation), axis=-1).astype(jnp.int32)
 
 
 def td_loss(spec: DQNSpec, hyper: DQNHyper, weights: Any, target: Any, batch: replay.Transition) -> Float[Array, ""]:
@@ -249,11 +242,11 @@ def _act(
     """One epsilon-greedy environment step and the row to remember it by."""
     n = spec.n_devices
     scenario, layout = agent.scenario, agent.scenario.layout
-    greedy = policy(spec, agent.hyper, state.weights)(scenario.params, layout, state.world)
+    best = greedy(spec, agent.hyper, state.weights, observe(layout, state.world))
     anywhere = jnp.minimum((uniform[n + 1] * n).astype(jnp.int32), n - 1)
     warm_up = steps_done < agent.hyper.learning_starts
     explore = warm_up | (uniform[n] < epsilon(agent.hyper, spec.total_steps, steps_done))
-    action = jnp.where(explore, anywhere, greedy)
+    action = jnp.where(explore, anywhere, best)
 
     after, reward, outcome = advance(scenario, state.world, action, draw_volumes(scenario.params, uniform[:n]))
     terminated = outcome.cause != Cause.NONE

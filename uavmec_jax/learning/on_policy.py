@@ -18,10 +18,7 @@ from uavmec_jax.learning.algorithm import AGENTS_AXIS, Agent
 from uavmec_jax.learning.networks import ActorCritic, n_weights, scale_ages
 from uavmec_jax.learning.optimizers import Descent
 from uavmec_jax.world.environment import advance, draw_volumes, is_truncated, observe, restart_if
-from uavmec_jax.world.layout import Layout
-from uavmec_jax.world.params import Params
 from uavmec_jax.world.physics import Cause, State, initial_state
-from uavmec_jax.world.rollout import Policy
 
 _WEIGHTS_STREAM = 2**32 - 1
 """``fold_in`` number of the initial weights; the iterations use their own numbers, from 0."""
@@ -154,13 +151,12 @@ def update(
     return jax.lax.fori_loop(first, last, lambda i, carry: iteration(agent, carry, i), state)
 
 
-def policy(spec: OnPolicySpec, hyper: OnPolicyHyper, weights: Any) -> Policy:
-    """The greedy policy of an agent: the likeliest action; ties go to the lowest number."""
-
-    def act(params: Params, layout: Layout, state: State, key: Any = None) -> Array:
-        return jnp.argmax(logits(spec, hyper, weights, observe(layout, state)[None])[0]).astype(jnp.int32)
-
-    return act
+def greedy(
+    spec: OnPolicySpec, hyper: OnPolicyHyper, weights: Any, observation: Float[Array, "*b two_n"]
+) -> Int[Array, "*b"]:
+    """The likeliest action; ties go to the lowest number."""
+    scores = logits(spec, hyper, weights, observation.reshape(-1, observation.shape[-1]))
+    return jnp.argmax(scores, axis=-1).astype(jnp.int32).reshape(observation.shape[:-1])
 
 
 def logits(spec: OnPolicySpec, hyper: OnPolicyHyper, weights: Any, observation: Float[Array, "b two_n"]) -> Array:

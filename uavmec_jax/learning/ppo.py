@@ -57,7 +57,7 @@ def algorithm(spec: PPOSpec) -> Algorithm:
         agent_bytes=spec.agent_bytes,
         init=partial(on_policy.init, spec, _OPTIMIZER),
         update=partial(on_policy.update, partial(_iteration, spec)),
-        policy=partial(on_policy.policy, spec),
+        greedy=partial(on_policy.greedy, spec),
     )
 
 

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from uavmec_jax.reporting.comparison import ALGORITHM_NAMES, is_comparison, label_rewards
+from uavmec_jax.reporting.table6 import ALGORITHM_NAMES, is_table6, label_rewards
 from uavmec_jax.reporting.tables import is_grid
 from uavmec_jax.studies.paper import TABLE5
 from uavmec_jax.studies.results import Results
@@ -29,8 +29,8 @@ def run_figure(results: Results) -> Figure:
     """The figure of a run: the grids of a power x comms study, else its training curves; lifetimes if nothing trained."""
     if not results.curves:
         return ladder_figure(results)
-    if is_comparison(results):
-        return comparison_figure(results)
+    if is_table6(results):
+        return table6_figure(results)
     return grid_figure(results) if is_grid(results) else curves_figure(results)
 
 
@@ -111,7 +111,7 @@ def _heat_map(axis: Axes, table: pd.DataFrame, limits: tuple[float, float]) -> m
     return image
 
 
-def comparison_figure(results: Results) -> Figure:
+def table6_figure(results: Results) -> Figure:
     """Rewards against algorithms and cells, one heat map per log guard: mean lifetime of the best weights."""
     cells = results.cells()
     cells["reward"] = label_rewards(cells)

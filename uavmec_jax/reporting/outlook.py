@@ -14,7 +14,7 @@ from uavmec_jax.reporting.geojson import plan_geojson
 from uavmec_jax.reporting.route_figure import route_figure
 from uavmec_jax.reporting.tables import spoken
 from uavmec_jax.studies import host
-from uavmec_jax.studies.results import write_text
+from uavmec_jax.studies.files import write_text
 from uavmec_jax.world.inventory import Inventory
 from uavmec_jax.world.inventory_files import inventory_text
 from uavmec_jax.world.physics import Cause

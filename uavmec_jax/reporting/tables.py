@@ -6,7 +6,7 @@ import pandas as pd
 from rich.table import Table
 from rich.text import Text
 
-from uavmec_jax.reporting.comparison import comparison_tables, half_interval, is_comparison
+from uavmec_jax.reporting.table6 import half_interval, is_table6, table6_tables
 from uavmec_jax.studies.paper import TABLE5
 from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.study import cell_axes
@@ -23,8 +23,8 @@ def is_grid(results: Results) -> bool:
 def tables(results: Results) -> dict[str, Table]:
     """The tables of a run by title: Table 5 or 6 where the study is such a grid, else a list of cells."""
     cells = results.cells()
-    if is_comparison(results):
-        return comparison_tables(cells)
+    if is_table6(results):
+        return table6_tables(cells)
     if not is_grid(results):
         return {"Lifetime in slots, mean over the seeds ± 95 %": list_table(results, cells)}
     trained = [name for name in ("best", "last") if name in results.policies]

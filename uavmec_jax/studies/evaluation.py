@@ -52,19 +52,20 @@ class Judgement:
         return {
             f"{prefix}_lifetime": self.mean_lifetime,
             f"{prefix}_lifetime_fixed": self.lifetime[:, -1],
-            f"{prefix}_cause": [_commonest(causes) for causes in self.cause[:, :-1]],
+            f"{prefix}_cause": [commonest(causes) for causes in self.cause[:, :-1]],
             f"{prefix}_cause_fixed": [Cause(cause).name.lower() for cause in self.cause[:, -1]],
-            f"{prefix}_first_device": [_device(row) for row in often],
+            f"{prefix}_first_device": [device_number(row) for row in often],
             f"{prefix}_first_share": often.max(axis=1),
             f"{prefix}_first_devices_fixed": [" ".join(str(i + 1) for i in np.flatnonzero(row)) for row in fixed],
         }
 
 
-def _commonest(causes: np.ndarray) -> str:
+def commonest(causes: np.ndarray) -> str:
+    """Name of the most frequent cause."""
     return Cause(int(np.bincount(causes).argmax())).name.lower()
 
 
-def _device(share: np.ndarray) -> int:
+def device_number(share: np.ndarray) -> int:
     """Number (from 1) of the device that is first most often; 0 if none ever fails."""
     return int(share.argmax()) + 1 if share.max() > 0 else 0
 
@@ -80,7 +81,7 @@ def judge_learned(
         keys: ``[A, D + 1]`` volume draws, from :func:`uavmec_jax.studies.study.evaluation_keys`.
         weights: name -> trained weights, leaves ``[A, ...]``.
     """
-    return {name: _judgement(_play_learned(algorithm, agents, keys, trained)) for name, trained in weights.items()}
+    return {name: judgement(_play_learned(algorithm, agents, keys, trained)) for name, trained in weights.items()}
 
 
 def judge_heuristics(agents: Agent, keys: Key[Array, "A D"], names: Iterable[str]) -> dict[str, Judgement]:
@@ -89,10 +90,11 @@ def judge_heuristics(agents: Agent, keys: Key[Array, "A D"], names: Iterable[str
     if not names:
         return {}
     played = play_heuristics(names, agents.scenario.params, agents.scenario.layout, keys)
-    return {name: _judgement(jax.tree.map(lambda leaf, k=k: leaf[k], played)) for k, name in enumerate(names)}
+    return {name: judgement(jax.tree.map(lambda leaf, k=k: leaf[k], played)) for k, name in enumerate(names)}
 
 
-def _judgement(episode: Episode) -> Judgement:
+def judgement(episode: Episode) -> Judgement:
+    """Episodes, leaves ``[A, D + 1, ...]``, as a judgement."""
     return Judgement(
         lifetime=np.asarray(episode.length),
         cause=np.asarray(episode.cause, np.int8),
@@ -170,8 +172,8 @@ def planned_columns(
     for name, judged in planned.items():
         if judged.cause is not None and judged.first_failure is not None:
             often = judged.first_failure.mean(axis=1)
-            columns[f"{name}_cause"] = [_commonest(causes) for causes in judged.cause]
-            columns[f"{name}_first_device"] = [_device(row) for row in often]
+            columns[f"{name}_cause"] = [commonest(causes) for causes in judged.cause]
+            columns[f"{name}_first_device"] = [device_number(row) for row in often]
             columns[f"{name}_first_share"] = often.max(axis=1)
     return columns
 

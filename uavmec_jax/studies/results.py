@@ -1,19 +1,19 @@
 """What a run leaves: files that are read back without pickle, each written whole or not at all."""
 
 import json
-import os
-import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from flax import traverse_util
 
 from uavmec_jax.errors import StudyError
+from uavmec_jax.studies.collection import WEIGHTS, Collection, read_collection, write_collection
+from uavmec_jax.studies.evaluation import device_number
+from uavmec_jax.studies.files import load_arrays, write_arrays, write_text
 from uavmec_jax.studies.schema import PLANNERS, Study
 from uavmec_jax.studies.statistics import mean_interval
 from uavmec_jax.studies.study import cell_axes, load_study, study_toml
@@ -22,7 +22,7 @@ SCHEMA = 2
 """Version of the run folder. In version 1 curves and weights did not name their algorithm: it was the DQN."""
 
 _STUDY, _RUN, _AGENTS = "study.toml", "run.json", "agents.csv"
-_CURVES, _EVALUATION, _WEIGHTS = "curves.npz", "evaluation.npz", "weights.npz"
+_CURVES, _EVALUATION = "curves.npz", "evaluation.npz"
 
 
 @dataclass
@@ -117,11 +117,28 @@ class Results:
         directory.mkdir(parents=True, exist_ok=True)
         write_text(directory / _STUDY, study_toml(self.study))
         write_text(directory / _AGENTS, self.agents.to_csv(index=False, float_format="%.6g"))
-        curves = traverse_util.flatten_dict(self.curves, sep="/")
-        for name, arrays in ((_CURVES, curves), (_EVALUATION, self.evaluation), (_WEIGHTS, self.weights)):
+        for name, arrays in (
+            (_CURVES, traverse_util.flatten_dict(self.curves, sep="/")),
+            (_EVALUATION, self.evaluation),
+        ):
             if arrays:  # nothing was trained: no curves, no weights
-                _write(directory / name, partial(_save_arrays, arrays=arrays))
+                write_arrays(directory / name, arrays)
+        if self.weights:
+            write_collection(directory / WEIGHTS, self._collection())
         write_text(directory / _RUN, json.dumps(self.run, indent=1) + "\n")
+
+    def _collection(self) -> Collection:
+        """The weights with all that is needed to make policies of them."""
+        axes = ["seed", *cell_axes(self.study)]
+        agents: dict[str, list[dict[str, Any]]] = {}
+        for row in json.loads(self.agents[axes].to_json(orient="records")):
+            agents.setdefault(row.get("algorithm", self.study.algorithm), []).append(row)
+        return Collection(
+            settings={name: getattr(self.study, name).model_dump(mode="json") for name in self.study.algorithms},
+            n_devices=self.study.params.n_devices,
+            agents=agents,
+            weights=self.weights,
+        )
 
 
 def _append(mine: dict[str, np.ndarray], theirs: Mapping[str, Any]) -> None:
@@ -133,26 +150,7 @@ def _append(mine: dict[str, np.ndarray], theirs: Mapping[str, Any]) -> None:
 
 def _first_to_fail(policy: str, share: np.ndarray) -> dict[str, Any]:
     """The device (from 1, 0 for none) that is first most often, of ``share [n]``."""
-    device = int(share.argmax()) + 1 if share.max() > 0 else 0
-    return {f"{policy}_first_device": device, f"{policy}_first_share": float(share.max())}
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file whole or not at all."""
-    _write(path, lambda file: file.write(text.encode()))
-
-
-def _write(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:
-    """Write a file whole or not at all."""
-    partial = path.with_name(f".{path.name}.part")
-    try:
-        with partial.open("wb") as file:
-            fill(file)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    return {f"{policy}_first_device": device_number(share), f"{policy}_first_share": float(share.max())}
 
 
 def holds_run(directory: Path) -> bool:
@@ -177,8 +175,8 @@ def load_results(directory: str | Path) -> Results:
         study=study,
         run=run,
         agents=agents,
-        curves=_load_nested(directory / _CURVES, run.get("schema", 1)) if study.algorithms else {},
-        evaluation=_load_arrays(directory / _EVALUATION),
+        curves=_nested_curves(directory / _CURVES, run.get("schema", 1)) if study.algorithms else {},
+        evaluation=load_arrays(directory / _EVALUATION),
     )
 
 
@@ -211,33 +209,12 @@ def load_weights(directory: str | Path, which: str = "best", algorithm: str | No
         algorithm: whose agents; by default the first algorithm of the run.
 
     Raises:
-        StudyError: there are none, or the file is damaged.
+        PolicyError: there are none, or the file is damaged.
     """
-    directory = Path(directory)
-    nested = _load_nested(directory / _WEIGHTS, _read_run(directory).get("schema", 1))
-    algorithm = next(iter(nested)) if algorithm is None else algorithm
-    chosen: dict[str, Any] = nested.get(algorithm, {}).get(which, {})
-    if not chosen:
-        raise StudyError(
-            f"{directory / _WEIGHTS}: holds no {which!r} weights of {algorithm}; "
-            f"give 'best' or 'last' and one of {', '.join(nested)}"
-        )
-    return chosen
+    return read_collection(Path(directory) / WEIGHTS).weights_of(which, algorithm)
 
 
-def _load_nested(path: Path, schema: int) -> dict[str, Any]:
-    """Arrays by the parts of their names, the first of which is the algorithm."""
-    nested: dict[str, Any] = traverse_util.unflatten_dict(_load_arrays(path), sep="/")
+def _nested_curves(path: Path, schema: int) -> dict[str, Any]:
+    """Curves by algorithm."""
+    nested: dict[str, Any] = traverse_util.unflatten_dict(load_arrays(path), sep="/")
     return nested if schema > 1 else {"dqn": nested}
-
-
-def _save_arrays(file: IO[bytes], arrays: dict[str, Any]) -> None:
-    np.savez_compressed(file, **arrays)
-
-
-def _load_arrays(path: Path) -> dict[str, np.ndarray]:
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
-        raise StudyError(f"{path}: cannot be read: {error}") from None

@@ -32,9 +32,9 @@ def make_scenario(layout: Layout | None = None, params: Params | None = None, re
     return Scenario(params=params, layout=layout, reward=make_reward() if reward is None else reward)
 
 
-def observe(layout: Layout, state: State) -> Float[Array, " two_n"]:
-    """The paper's observation, ``[2n]`` f32: n battery fractions in [0, 1], then n data ages as plain counts."""
-    return jnp.concatenate([state.battery / layout.capacity, state.age.astype(jnp.float32)])
+def observe(layout: Layout, state: State) -> Float[Array, "*b two_n"]:
+    """The paper's observation, ``[..., 2n]`` f32: n battery fractions in [0, 1], then n data ages as plain counts."""
+    return jnp.concatenate([state.battery / layout.capacity, state.age.astype(jnp.float32)], axis=-1)
 
 
 def draw_volumes(params: Params, uniform: Float[Array, "*shape"]) -> Float[Array, "*shape"]:

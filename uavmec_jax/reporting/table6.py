@@ -13,7 +13,7 @@ from uavmec_jax.studies.results import Results
 ALGORITHM_NAMES = {"dqn": "DQN", "ppo": "PPO", "a2c": "A2C"}
 
 
-def is_comparison(results: Results) -> bool:
+def is_table6(results: Results) -> bool:
     """Whether a study holds rewards against algorithms and nothing else."""
     axes = set(results.study.axes) - {"powered", "connected", "cells", "seeds", "guard"}
     return axes == {"algorithm", "reward"}
@@ -28,20 +28,20 @@ def label_rewards(cells: pd.DataFrame) -> list[str]:
     return [f"{reward}" if guard == first else f"{reward}  ({guard})" for reward, guard in pairs]
 
 
-def comparison_tables(cells: pd.DataFrame) -> dict[str, Table]:
+def table6_tables(cells: pd.DataFrame) -> dict[str, Table]:
     """The paper's table, one for each of its columns of cells, and those who learn nothing."""
     guard = f"; logarithms guarded by {cells['guard'].iloc[0]} where nothing else is said" if "guard" in cells else ""
     how = f"best weights: mean over the seeds ± 95 %, maximum / the paper's maximum; below: last weights{guard}"
     places = dict.fromkeys(zip(cells.powered, cells.connected, strict=True))
     return {
-        f"{powered} powered, {connected} connected: lifetime in slots, {how}": comparison_table(
+        f"{powered} powered, {connected} connected: lifetime in slots, {how}": table6_table(
             cells[(cells.powered == powered) & (cells.connected == connected)]
         )
         for powered, connected in places
     } | {"Lifetime in slots of those who learn nothing, on the same layouts": _others(cells)}
 
 
-def comparison_table(cells: pd.DataFrame) -> Table:
+def table6_table(cells: pd.DataFrame) -> Table:
     """One place of Table 6: rewards down, algorithms across. The best mean of each algorithm is bold."""
     cells = cells.assign(reward_shown=label_rewards(cells))
     algorithms = list(dict.fromkeys(cells["algorithm"]))

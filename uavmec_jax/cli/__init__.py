@@ -1,0 +1,43 @@
+"""The command `uavmec`: parse, call, show. What it does lives in the package; jax is imported only when needed."""
+
+from typing import Any
+
+import click
+
+from uavmec_jax.cli.common import fail
+from uavmec_jax.cli.machine import doctor
+from uavmec_jax.cli.scenarios import evaluate, plan
+from uavmec_jax.cli.studies import compare, run, show, validate
+from uavmec_jax.errors import UserError
+
+
+class OneLine(click.Group):
+    """A group whose commands tell a user's mistake, or a full or closed disk, in one line: exit code 2."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command."""
+        try:
+            return super().invoke(ctx)
+        except UserError as error:
+            fail(error)
+        except OSError as error:
+            fail(f"{error.filename}: {error.strerror}" if error.filename else error)
+
+
+@click.group(cls=OneLine, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="uavmec-jax")
+def main() -> None:
+    """Which device should a rescue UAV serve next, and which will fail first?
+
+    \b
+    uavmec run table5 --quick     the paper's Table 5 on this machine, in under a minute
+    uavmec run my-study.toml      a study of your own
+    uavmec plan my-town.toml      tours for your own devices, what fails first, what to repair
+    uavmec show runs/...          the tables of a run again
+    uavmec evaluate runs/...      one of its policies on one scenario
+    uavmec compare runs/a runs/b  two runs, seed by seed
+    """
+
+
+for _command in (run, plan, evaluate, show, compare, validate, doctor):
+    main.add_command(_command)

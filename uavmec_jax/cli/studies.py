@@ -1,0 +1,137 @@
+"""Commands about studies and the runs they leave."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from uavmec_jax.cli.common import assignment, command_line, new_folder, print_results, print_tables
+
+QUICK_STEPS, QUICK_SEEDS, QUICK_VALIDATE_EVERY = 50_000, 3, 5_000
+
+
+@click.command()
+@click.argument("study")
+@click.option("--seeds", type=int, help="Number of seeds (axes.seeds).")
+@click.option("--steps", type=int, help="Environment steps of one agent.")
+@click.option(
+    "--quick", is_flag=True, help=f"{QUICK_SEEDS} seeds x {QUICK_STEPS:,} steps: a first look within a minute."
+)
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="Override any setting, e.g. --set dqn.gamma=0.99 or --set axes.learning_rate=[0.001,0.0071].",
+)
+@click.option("--out", type=click.Path(path_type=Path), help="Folder of the run (default: runs/<study>-<time>).")
+@click.option("--json", "as_json", is_flag=True, help="Print the cells as JSON on standard output.")
+def run(
+    study: str,
+    seeds: int | None,
+    steps: int | None,
+    quick: bool,
+    settings: tuple[str, ...],
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Train and judge STUDY: a study that ships with the package (table5, table5-tuned, table6, planning) or a TOML file."""
+    overrides: dict[str, Any] = {}
+    if quick:
+        overrides |= {
+            "axes.seeds": QUICK_SEEDS,
+            "steps": QUICK_STEPS,
+            "evaluation.validate_every": QUICK_VALIDATE_EVERY,
+            "evaluation.planner_draws": 1,
+        }
+    overrides |= {name: value for name, value in (("axes.seeds", seeds), ("steps", steps)) if value is not None}
+    overrides |= dict(assignment(setting) for setting in settings)
+
+    from uavmec_jax.studies import host
+
+    host.use_every_core()
+    from rich.console import Console
+
+    from uavmec_jax.reporting import figures
+    from uavmec_jax.reporting.progress import progress_bar
+    from uavmec_jax.studies.run import check_directory, plan_study, run_study
+    from uavmec_jax.studies.study import load_study
+
+    console = Console(stderr=as_json)
+    resolved = load_study(study, overrides)
+    directory = out or new_folder(resolved.name)
+    check_directory(directory)
+    plan = plan_study(resolved)
+    console.print(f"[bold]{resolved.name}[/bold]: {plan}")
+    with progress_bar(console, plan) as on_progress:
+        results = run_study(resolved, directory, command=command_line(), on_progress=on_progress)
+    if len(results.agents):
+        figures.save(figures.run_figure(results), directory / "figure.png")
+        print_results(results, directory, console, as_json)
+    if not results.run["complete"]:
+        done = len(results.agents)
+        kept = f"{done} finished agents are kept in {directory}" if done else "no block was finished, nothing was kept"
+        click.echo(f"interrupted: {kept}", err=True)
+        sys.exit(130)
+
+
+@click.command()
+@click.argument("directory", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print the cells as JSON on standard output.")
+def show(directory: Path, as_json: bool) -> None:
+    """Print the tables of the run in DIRECTORY again."""
+    from rich.console import Console
+
+    from uavmec_jax.studies.results import load_results
+
+    results = load_results(directory)
+    print_results(results, directory, Console(stderr=as_json), as_json)
+
+
+@click.command()
+@click.argument("run_a", type=click.Path(path_type=Path))
+@click.argument("run_b", type=click.Path(path_type=Path))
+@click.option("--a", "where_a", multiple=True, metavar="NAME=VALUE", help="Agents of A, e.g. --a algorithm=dqn.")
+@click.option("--b", "where_b", multiple=True, metavar="NAME=VALUE", help="Agents of B.")
+@click.option("--policy-a", default="best", help="Policy of A: best, last, oldest-first, ... (default: best).")
+@click.option("--policy-b", default="best", help="Policy of B (default: best).")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON on standard output.")
+def compare(
+    run_a: Path,
+    run_b: Path,
+    where_a: tuple[str, ...],
+    where_b: tuple[str, ...],
+    policy_a: str,
+    policy_b: str,
+    as_json: bool,
+) -> None:
+    """Compare RUN_A with RUN_B seed by seed: paired differences, interquartile means, probability of improvement."""
+    from rich.console import Console
+
+    from uavmec_jax.reporting.compare import comparison
+    from uavmec_jax.studies.compare import Side
+    from uavmec_jax.studies.results import load_results
+
+    a = Side(load_results(run_a), policy_a, dict(assignment(one, "--a") for one in where_a))
+    b = Side(load_results(run_b), policy_b, dict(assignment(one, "--b") for one in where_b))
+    tables, data = comparison(a, b)
+    if as_json:
+        click.echo(json.dumps({"command": command_line(), **data}, indent=1))
+        return
+    print_tables(Console(), tables, [])
+
+
+@click.command()
+@click.argument("file")
+@click.option("--json", "as_json", is_flag=True, help="Print the resolved study as JSON.")
+def validate(file: str, as_json: bool) -> None:
+    """Check the study FILE (or a shipped study) without running it."""
+    from uavmec_jax.studies.study import load_study, n_agents
+
+    study = load_study(file)
+    if as_json:
+        click.echo(study.model_dump_json(indent=1))
+    else:
+        click.echo(f"{file}: a valid study: {n_agents(study):,} agents x {study.steps:,} steps")

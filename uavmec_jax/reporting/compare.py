@@ -1,0 +1,75 @@
+"""Tables of comparisons: two runs, and one policy beside others on one scenario."""
+
+import json
+from typing import Any
+
+import pandas as pd
+from rich.table import Table
+from rich.text import Text
+
+from uavmec_jax.reporting.table6 import half_interval
+from uavmec_jax.studies.compare import Side, differences, overall, pair
+
+_MEASURES = {
+    "difference": "mean paired difference B - A, slots",
+    "iqm_a": "interquartile mean of A, slots",
+    "iqm_b": "interquartile mean of B, slots",
+    "improvement": "probability that B lives longer than A",
+}
+
+
+def comparison(a: Side, b: Side) -> tuple[dict[str, Table], dict[str, Any]]:
+    """Tables by title, and the same as plain data.
+
+    Raises:
+        StudyError: the runs have nothing to compare.
+    """
+    both, axes = pair(a, b)
+    cells, whole = differences(both, axes), overall(both, axes)
+    titles = {
+        f"Lifetime in slots, seed by seed. A: {a.name}; B: {b.name}": _cells(cells, axes),
+        f"Over all {len(cells)} cells, {len(both)} pairs": _whole(whole),
+    }
+    data = {
+        "a": a.name,
+        "b": b.name,
+        "pairs": len(both),
+        "cells": json.loads(cells.to_json(orient="records")),
+        "overall": {name: dict(zip(("value", "low", "high"), one, strict=True)) for name, one in whole.items()},
+    }
+    return titles, data
+
+
+def _cells(cells: pd.DataFrame, axes: list[str]) -> Table:
+    table = Table()
+    for name in (*axes, "seeds", "A", "B", "B - A"):
+        table.add_column(name, justify="right")
+    for _, cell in cells.iterrows():
+        place = [value if isinstance(value := cell[name], str) else f"{value:g}" for name in (*axes, "seeds")]
+        style = "green" if cell["low"] > 0 else "red" if cell["high"] < 0 else "default"
+        difference = Text(f"{cell['difference']:+.2f}", style=style)
+        difference.append(half_interval(cell["low"], cell["high"]), style="dim")
+        table.add_row(*place, f"{cell['a']:.2f}", f"{cell['b']:.2f}", difference)
+    return table
+
+
+def _whole(whole: dict[str, tuple[float, float, float]]) -> Table:
+    table = Table()
+    for name, justify in (("measure", "left"), ("value", "right"), ("95 %", "right")):
+        table.add_column(name, justify=justify)  # type: ignore[arg-type]
+    for name, words in _MEASURES.items():
+        value, low, high = whole[name]
+        table.add_row(words, f"{value:.3f}", f"{low:.3f} to {high:.3f}" if low == low else "-")
+    return table
+
+
+def evaluation_table(rows: list[dict[str, Any]]) -> Table:
+    """One line per policy on one scenario, from :func:`uavmec_jax.studies.scenario.evaluate`."""
+    table = Table()
+    for name in ("policy", "lifetime, slots", "shortest", "longest", "ends by", "first to fail"):
+        table.add_column(name, justify="left" if name == "policy" else "right")
+    for row in rows:
+        mean = Text(f"{row['mean']:.2f}").append(half_interval(row["low"], row["high"]), style="dim")
+        device = f"#{row['first_device']} {row['first_share']:.0%}" if row["first_device"] else "UAV"
+        table.add_row(row["policy"], mean, str(row["shortest"]), str(row["longest"]), row["cause"], device)
+    return table

@@ -1,0 +1,179 @@
+"""Collections of trained weights with all that makes them policies: one file, versioned, checked, without pickle.
+
+A run leaves one collection of all its agents, ``weights.npz``; a policy saved on its own is a collection of one.
+"""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import traverse_util
+
+from uavmec_jax.errors import PolicyError, StudyError
+from uavmec_jax.learning.algorithm import Algorithm
+from uavmec_jax.learning.registry import ALGORITHMS
+from uavmec_jax.studies.files import load_arrays, write_arrays
+
+SCHEMA = 1
+"""Version of the file."""
+
+WEIGHTS = "weights.npz"
+"""Name of a run's collection in its folder."""
+
+_HEADER = "header"
+
+
+@dataclass(frozen=True)
+class Collection:
+    """Trained agents.
+
+    Attributes:
+        settings: algorithm -> its settings, traced and static, as in a study.
+        n_devices: number of devices.
+        agents: algorithm -> one dictionary per agent: its value on every axis of the study.
+        weights: ``<algorithm>/<best or last>/...``, leaves ``[A, ...]`` in the order of the agents.
+    """
+
+    settings: Mapping[str, Mapping[str, Any]]
+    n_devices: int
+    agents: Mapping[str, list[dict[str, Any]]]
+    weights: Mapping[str, np.ndarray]
+
+    def weights_of(self, which: str, algorithm: str | None = None) -> dict[str, Any]:
+        """Weights as the networks take them, leaves ``[A, ...]``; by default of the first algorithm.
+
+        Raises:
+            PolicyError: there are none.
+        """
+        name = next(iter(self.agents)) if algorithm is None else algorithm
+        nested = traverse_util.unflatten_dict(dict(self.weights), sep="/")
+        found: dict[str, Any] = nested.get(name, {}).get(which, {})
+        if not found:
+            kinds = sorted({kind for own in nested.values() for kind in own})
+            raise PolicyError(
+                f"there are no {which!r} weights of {name!r}; there are {' and '.join(kinds)} of {', '.join(nested)}"
+            )
+        return found
+
+    def algorithm(self, name: str) -> Algorithm:
+        """The algorithm of some of the agents, as far as policies need it."""
+        settings = {key: _tupled(value) for key, value in self.settings[name].items()}
+        return ALGORITHMS[name].make(settings, total_steps=1, n_devices=self.n_devices, max_age=1)
+
+    def hyper(self, name: str, agent: Mapping[str, Any]) -> Any:
+        """The hyperparameters of one agent."""
+        values = dict(self.settings[name]) | dict(agent)
+        return ALGORITHMS[name].hyper(**{field: values[field] for field in ALGORITHMS[name].traced})
+
+    def pick(self, axes: Mapping[str, Any]) -> tuple[str, int]:
+        """The algorithm and the place of the one agent that has the given values on its axes.
+
+        Raises:
+            PolicyError: none or several do, or there is no such axis.
+        """
+        everyone = [(name, place, who) for name, own in self.agents.items() for place, who in enumerate(own)]
+        known = sorted({axis for *_, who in everyone for axis in who} | {"algorithm"})
+        for axis in axes:
+            if axis not in known:
+                raise PolicyError(f"{axis!r} tells no agents apart; they have {', '.join(known)}")
+        found = [
+            (name, place)
+            for name, place, who in everyone
+            if all(({"algorithm": name} | who)[axis] == value for axis, value in axes.items())
+        ]
+        if len(found) == 1:
+            return found[0]
+        asked = ", ".join(f"{axis}={value}" for axis, value in axes.items()) or "anything"
+        if not found:
+            raise PolicyError(f"none of the {len(everyone)} agents has {asked}")
+        differ = [axis for axis in known if len({str(({"algorithm": n} | w).get(axis)) for n, _, w in everyone}) > 1]
+        raise PolicyError(f"{len(found)} agents have {asked}; say which: they differ in {', '.join(differ)}")
+
+
+def write_collection(path: Path, collection: Collection) -> None:
+    """Write a collection, whole or not at all."""
+    facts = {
+        "schema": SCHEMA,
+        "package": f"uavmec-jax {metadata.version('uavmec-jax')}",
+        **{field: getattr(collection, field) for field in ("settings", "n_devices", "agents")},
+    }
+    facts["sha256"] = _digest(facts, collection.weights)
+    write_arrays(path, {_HEADER: np.array(json.dumps(facts)), **collection.weights})
+
+
+def read_collection(path: Path) -> Collection:
+    """Read and check a collection.
+
+    Raises:
+        PolicyError: the file is not there, is damaged, was altered, is something else or from a newer version.
+    """
+    try:
+        arrays = load_arrays(path)
+    except StudyError as error:
+        raise PolicyError(str(error)) from None
+    try:
+        facts = json.loads(str(arrays.pop(_HEADER)))
+        schema, digest = facts["schema"], facts.pop("sha256")
+    except (KeyError, ValueError, TypeError):
+        raise PolicyError(f"{path}: is not a file of policies, or one from before they had a header") from None
+    if schema != SCHEMA:
+        raise PolicyError(f"{path}: schema is {schema!r}; this version reads {SCHEMA}")
+    if digest != _digest(facts, arrays):
+        raise PolicyError(f"{path}: was altered: its contents do not fit their SHA-256")
+    found = Collection(facts["settings"], facts["n_devices"], facts["agents"], arrays)
+    _check_shapes(path, found)
+    return found
+
+
+def _digest(facts: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
+    digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
+    for name in sorted(arrays):
+        leaf = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {leaf.dtype.str} {leaf.shape}".encode())
+        digest.update(leaf.tobytes())
+    return digest.hexdigest()
+
+
+def _check_shapes(path: Path, collection: Collection) -> None:
+    """The weights are those of the networks that the settings describe (another version may have had others)."""
+    for name, agents in collection.agents.items():
+        try:
+            wanted = _shapes(collection, name)
+        except (KeyError, TypeError, ValueError) as error:
+            raise PolicyError(f"{path}: its {name} is not one that this version knows: {error}") from None
+        for which in {key.split("/")[1] for key in collection.weights if key.startswith(f"{name}/")}:
+            prefix = f"{name}/{which}/"
+            found = {key.removeprefix(prefix): leaf.shape for key, leaf in collection.weights.items() if prefix in key}
+            if found != {key: (len(agents), *shape) for key, shape in wanted}:
+                raise PolicyError(f"{path}: its weights do not fit its {name} network of this version")
+
+
+def _shapes(collection: Collection, name: str) -> Iterable[tuple[str, tuple[int, ...]]]:
+    settings, spec = collection.settings[name], ALGORITHMS[name].spec
+    sizes = {"n_devices": collection.n_devices}
+    network = spec(**{static: _tupled(settings[static]) for static in ALGORITHMS[name].static}, **sizes).network
+    made: Any = jax.eval_shape(network.init, jax.random.key(0), jnp.zeros((1, 2 * collection.n_devices)))
+    return [(key, leaf.shape) for key, leaf in traverse_util.flatten_dict(made, sep="/").items()]
+
+
+def _tupled(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def of_one(collection: Collection, name: str, place: int, which: str) -> Collection:
+    """The collection of one agent and one kind of weights."""
+    prefix = f"{name}/{which}/"
+    return dataclasses.replace(
+        collection,
+        settings={name: collection.settings[name]},
+        agents={name: [collection.agents[name][place]]},
+        weights={key: leaf[place : place + 1] for key, leaf in collection.weights.items() if key.startswith(prefix)},
+    )

@@ -1,0 +1,117 @@
+"""Policies by name or from files: heuristics, planners, and what a run has trained."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from uavmec_jax.errors import PolicyError
+from uavmec_jax.planning.heuristics import HEURISTICS
+from uavmec_jax.planning.lookahead import rollout_planner
+from uavmec_jax.studies.collection import WEIGHTS, Collection, of_one, read_collection, write_collection
+from uavmec_jax.world.environment import observe
+from uavmec_jax.world.layout import Layout
+from uavmec_jax.world.params import Params
+from uavmec_jax.world.physics import State
+from uavmec_jax.world.rollout import Policy
+from uavmec_jax.world.settings import nearest
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedPolicy:
+    """The greedy policy of one trained agent; called as every policy, it makes its own observation.
+
+    Attributes:
+        algorithm: name of what trained it.
+        trained_on: its value on every axis of the study: seed, powered and connected devices, ...
+        n_devices: number of devices; fixed by the network.
+        collection: the file's contents, of this agent alone.
+    """
+
+    algorithm: str
+    trained_on: Mapping[str, Any]
+    n_devices: int
+    collection: Collection = field(repr=False)
+    _greedy: Any = field(repr=False)
+
+    @classmethod
+    def of(cls, collection: Collection, name: str, place: int, which: str) -> "TrainedPolicy":
+        """The policy of one agent of a collection."""
+        alone = of_one(collection, name, place, which)
+        who = alone.agents[name][0]
+        weights = jax.tree.map(lambda leaf: jax.numpy.asarray(leaf[0]), alone.weights_of(which))
+        greedy = partial(alone.algorithm(name).greedy, alone.hyper(name, who), weights)
+        return cls(name, who, alone.n_devices, alone, jax.jit(greedy))
+
+    def __call__(self, params: Params, layout: Layout, state: State, key: Any = None) -> Array:
+        """The device to visit, int32 ``[...]``, in states with any batch axes in front.
+
+        Raises:
+            PolicyError: the layout has another number of devices.
+        """
+        if layout.capacity.shape[-1] != self.n_devices:
+            raise PolicyError(
+                f"the policy was trained for {self.n_devices} devices; the layout has {layout.capacity.shape[-1]}"
+            )
+        chosen: Array = self._greedy(observe(layout, state))
+        return chosen
+
+    def act(self, observation: Any) -> np.ndarray:
+        """The device to visit for observations ``[..., 2n]``: NumPy in, NumPy int32 ``[...]`` out.
+
+        Raises:
+            PolicyError: the observation has another shape, or holds what is no number.
+        """
+        try:
+            given = np.asarray(observation, np.float32)
+        except (TypeError, ValueError) as error:
+            raise PolicyError(f"the observation is not an array of numbers: {error}") from None
+        size = 2 * self.n_devices
+        if given.shape[-1:] != (size,):
+            raise PolicyError(f"the observation has the shape {given.shape}; it should be ({size},) or (..., {size})")
+        return np.asarray(self._greedy(given))
+
+    def save(self, path: str | Path) -> None:
+        """Write the policy to a file of its own (``.npz``), whole or not at all."""
+        write_collection(Path(path), self.collection)
+
+
+def load_policy(source: str | Path, which: str = "best", **axes: Any) -> Policy:
+    """A policy by name, from a file, or of one agent of a run.
+
+    Args:
+        source: a name in :data:`HEURISTICS`, ``"rollout"``, a policy file, or the folder of a run.
+        which: ``"best"`` or ``"last"`` weights of a run's agent; a policy file has one kind.
+        axes: which agent of a run, e.g. ``powered=8, connected=8, seed=3, algorithm="ppo"``; what tells no agents apart
+            may be left out.
+
+    Returns:
+        ``policy(params, layout, state, key=None) -> action``; a :class:`TrainedPolicy` if it was trained.
+
+    Raises:
+        PolicyError: nothing of that name; a file that is damaged, altered or from another version; or no agent, or
+            several, on those axes.
+    """
+    if str(source) in HEURISTICS:
+        return HEURISTICS[str(source)]
+    if str(source) == "rollout":
+        return rollout_planner()
+    path = Path(source)
+    if path.is_dir():
+        path = path / WEIGHTS
+    elif not path.exists() and not path.suffix:
+        raise PolicyError(
+            f"{source}: neither a file nor a policy by name; {nearest(str(source), [*HEURISTICS, 'rollout'])}"
+        )
+    collection = read_collection(path)
+    kinds = {key.split("/")[1] for key in collection.weights}
+    try:
+        name, place = collection.pick(axes)
+        return TrainedPolicy.of(collection, name, place, next(iter(kinds)) if len(kinds) == 1 else which)
+    except PolicyError as error:
+        raise PolicyError(f"{path}: {error}") from None
