@@ -11,12 +11,12 @@ from uavmec_jax.world.params import Params
 from uavmec_jax.world.rewards import make_reward
 
 
-def make_agent(seed=0, powered=8, connected=8, params=None, **hyper) -> Agent:
-    """One agent on a random layout."""
+def make_agent(seed=0, powered=8, connected=8, params=None, kind=DQNHyper, **hyper) -> Agent:
+    """One agent on a random layout; ``kind`` declares its hyperparameters."""
     params = Params() if params is None else params
     layout = sample_layout(jax.random.key(seed), params, powered, connected)
     scenario = Scenario(params=params, layout=layout, reward=make_reward())
-    return jax.tree.map(jnp.asarray, Agent(jax.random.key(1000 + seed), scenario, DQNHyper(**hyper)))
+    return jax.tree.map(jnp.asarray, Agent(jax.random.key(1000 + seed), scenario, kind(**hyper)))
 
 
 def stack(agents) -> Agent:

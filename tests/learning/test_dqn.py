@@ -86,6 +86,20 @@ def test_warm_up_explores_uniformly():
     assert counts.min() > 1400  # 20,000 / 12 = 1,667, standard deviation 39
 
 
+def random_batch(hyper, seed=0):
+    rng = np.random.default_rng(seed)
+    ages = rng.integers(0, 12, (2, 16, 12))
+    observation = np.concatenate([rng.random((2, 16, 12)), ages], axis=-1).astype(np.float32)
+    return Transition(
+        observation=jnp.asarray(observation[0]),
+        action=jnp.asarray(rng.integers(0, 12, 16), jnp.int32),
+        reward=jnp.asarray(rng.normal(size=16), jnp.float32),
+        terminated=jnp.asarray(rng.random(16) < 0.3, jnp.float32),
+        next_observation=jnp.asarray(observation[1]),
+        discount=jnp.full(16, hyper.gamma),
+    )
+
+
 def numpy_update(weights, target, batch, hyper):
     """One DQN update in NumPy, float64: forward, Huber, backward, clip, Adam's first step."""
     layers = [{k: np.asarray(v, float) for k, v in weights["params"][f"TorchDense_{i}"].items()} for i in range(3)]
@@ -124,18 +138,7 @@ def numpy_update(weights, target, batch, hyper):
 @pytest.mark.parametrize("max_grad_norm", [10.0, 0.01])
 def test_update_against_numpy(max_grad_norm):
     spec, hyper = DQNSpec(), DQNHyper(max_grad_norm=max_grad_norm, learning_starts=0)
-    rng = np.random.default_rng(0)
-    observation = np.concatenate([rng.random((2, 16, 12)), rng.integers(0, 12, (2, 16, 12))], axis=-1).astype(
-        np.float32
-    )
-    batch = Transition(
-        observation=jnp.asarray(observation[0]),
-        action=jnp.asarray(rng.integers(0, 12, 16), jnp.int32),
-        reward=jnp.asarray(rng.normal(size=16), jnp.float32),
-        terminated=jnp.asarray(rng.random(16) < 0.3, jnp.float32),
-        next_observation=jnp.asarray(observation[1]),
-        discount=jnp.full(16, hyper.gamma),
-    )
+    batch = random_batch(hyper)
     agent = make_agent(0)
     state = dqn.init(spec, agent)
     target = jax.tree.map(lambda leaf: leaf * 1.1, state.weights)
@@ -206,3 +209,52 @@ def test_frozen_agent_stays_as_it_was():
     late = train(SPEC, agents, 30, 100, state=early)
     assert early.diverged_at[0] == late.diverged_at[0] == 104
     jax.tree.map(assert_array_equal, early.weights, late.weights)
+
+
+def huber(error):
+    return np.where(np.abs(error) < 1, 0.5 * error**2, np.abs(error) - 0.5)
+
+
+def test_double_lets_the_online_network_choose():
+    plain, double = DQNSpec(), DQNSpec(double=True)
+    weights, target = (dqn.init(plain, make_agent(seed)).weights for seed in (0, 1))
+    batch = random_batch(HYPER)
+    online, later = (np.asarray(dqn.q_values(plain, HYPER, w, batch.next_observation)) for w in (weights, target))
+    value = np.asarray(dqn.q_values(plain, HYPER, weights, batch.observation))[np.arange(16), batch.action]
+    for spec, best in ((plain, later.max(axis=1)), (double, later[np.arange(16), online.argmax(axis=1)])):
+        goal = np.asarray(batch.reward) + (1 - np.asarray(batch.terminated)) * 0.98 * best
+        assert_allclose(dqn.td_loss(spec, HYPER, weights, target, batch), huber(value - goal).mean(), rtol=1e-5)
+    assert (online.argmax(axis=1) != later.argmax(axis=1)).any()
+
+
+def test_dueling_values_have_advantages_of_mean_zero():
+    spec = DQNSpec(dueling=True)
+    weights = dqn.init(spec, make_agent(0)).weights
+    batch = random_batch(HYPER)
+    x = np.asarray(batch.observation, float)
+    layers = weights["params"]
+    dense = lambda name, x: x @ np.asarray(layers[name]["kernel"], float) + np.asarray(layers[name]["bias"])  # noqa: E731
+    for name in ("TorchDense_0", "TorchDense_1"):
+        x = np.maximum(dense(name, x), 0)
+    advantage, value = dense("TorchDense_2", x), dense("TorchDense_3", x)
+    expected = value + advantage - advantage.mean(axis=1, keepdims=True)
+    assert_allclose(dqn.q_values(spec, HYPER, weights, batch.observation), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_soft_update_of_the_target():
+    weights, target = (dqn.init(SPEC, make_agent(seed)).weights for seed in (0, 1))
+    leaf = lambda tree: np.asarray(tree["params"]["TorchDense_1"]["kernel"])  # noqa: E731
+    mixed = dqn.mix_if(jnp.asarray(True), 0.25, weights, target)
+    assert_allclose(leaf(mixed), 0.25 * leaf(weights) + 0.75 * leaf(target), rtol=1e-6)
+    jax.tree.map(assert_array_equal, dqn.mix_if(jnp.asarray(True), 1.0, weights, target), weights)
+    jax.tree.map(assert_array_equal, dqn.mix_if(jnp.asarray(False), 0.25, weights, target), target)
+
+
+@pytest.mark.slow
+def test_all_variants_together_train():
+    spec = DQNSpec(total_steps=4_000, double=True, dueling=True, n_step=3, replay_capacity=1_000)
+    state = train(spec, stack([make_agent(0, tau=0.01, target_interval=4), make_agent(1)]), 0, 1_000)
+    assert (state.diverged_at[:2] == -1).all()
+    moved = [(a != b).any() for a, b in zip(*map(jax.tree.leaves, (state.target, state.weights)), strict=True)]
+    assert all(moved)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.weights))

@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose
 
 from tests.worlds import three_devices
 from uavmec_jax.world.physics import State
-from uavmec_jax.world.rewards import REWARDS, TERMS, make_reward, make_weights, reward_of, reward_terms
+from uavmec_jax.world.rewards import REWARDS, TERMS, make_reward, make_weights, needs_guard, reward_of, reward_terms
 
 LAYOUT = three_devices()
 
@@ -84,3 +84,28 @@ def test_bad_names_are_named():
         make_weights({"A": float("nan")})
     with pytest.raises(ValueError, match="unknown log guard"):
         make_reward("A", "none")
+
+
+def test_a_function_of_the_terms_is_a_reward():
+    product = make_reward(lambda terms: terms["U"] * terms["M"] - jnp.where(terms["O"] > 5, 2.0, 0.0))
+    assert_allclose(reward_of(product, LAYOUT, BEFORE, jnp.int32(1), AFTER), 5 * 0.25 - 2)
+    guarded = make_reward(lambda terms: terms["log A"], guard="log1p")
+    assert_allclose(reward_of(guarded, LAYOUT, BEFORE, jnp.int32(1), AFTER), np.log(4), rtol=1e-6)
+
+
+def test_the_function_is_checked_when_it_is_given():
+    with pytest.raises(ValueError, match=r"asks for the term 'Q'; terms are A, U, M, O, log A"):
+        make_reward(lambda terms: terms["Q"])
+    with pytest.raises(ValueError, match=r"returns an array of shape \(2,\); it should return a scalar"):
+        make_reward(lambda terms: jnp.stack([terms["A"], terms["U"]]))
+
+
+def test_only_log_a_and_log_o_need_the_guard():
+    assert [name for name in REWARDS if needs_guard(name)] == [
+        "log A",
+        "-log O",
+        "log A+log U+log M-log O",
+        "U+log(A/O)",
+    ]
+    assert needs_guard({"log O": 0.5})
+    assert not needs_guard({"log U": 1.0, "A": 2.0})

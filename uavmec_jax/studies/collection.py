@@ -84,17 +84,14 @@ class Collection:
         for axis in axes:
             if axis not in known:
                 raise PolicyError(f"{axis!r} tells no agents apart; they have {', '.join(known)}")
-        found = [
-            (name, place)
-            for name, place, who in everyone
-            if all(({"algorithm": name} | who)[axis] == value for axis, value in axes.items())
-        ]
+        named = [(name, place, {"algorithm": name} | who) for name, place, who in everyone]
+        found = [one for one in named if all(one[2][axis] == value for axis, value in axes.items())]
         if len(found) == 1:
-            return found[0]
+            return found[0][:2]
         asked = ", ".join(f"{axis}={value}" for axis, value in axes.items()) or "anything"
         if not found:
             raise PolicyError(f"none of the {len(everyone)} agents has {asked}")
-        differ = [axis for axis in known if len({str(({"algorithm": n} | w).get(axis)) for n, _, w in everyone}) > 1]
+        differ = [axis for axis in known if len({str(who.get(axis)) for *_, who in found}) > 1]
         raise PolicyError(f"{len(found)} agents have {asked}; say which: they differ in {', '.join(differ)}")
 
 

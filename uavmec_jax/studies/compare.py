@@ -67,11 +67,12 @@ def pair(a: Side, b: Side) -> tuple[pd.DataFrame, list[str]]:
         StudyError: they have none in common, or an agent of one fits several of the other.
     """
     left, right = a.lifetimes(), b.lifetimes()
-    shared = [str(axis) for axis in left if axis in set(right) - {"lifetime"}]
+    pinned = {axis for axis in a.where if axis in b.where}  # each side has one value there, not always the same
+    shared = [str(axis) for axis in left if axis in set(right) - {"lifetime"} - pinned]
     for side, table in ((a, left), (b, right)):
         twice = table[table.duplicated(shared)]
         if len(twice):
-            others = [str(axis) for axis in table if axis not in (*shared, "lifetime")]
+            others = [str(axis) for axis in table if axis not in (*shared, *pinned, "lifetime")]
             free = [axis for axis in others if table[axis].nunique() > 1]
             raise StudyError(f"{side.name}: several agents fit one of the other run; say which of {', '.join(free)}")
     both = left.merge(right, on=shared, suffixes=("_a", "_b"))

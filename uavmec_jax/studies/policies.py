@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -42,9 +43,9 @@ class TrainedPolicy:
     @classmethod
     def of(cls, collection: Collection, name: str, place: int, which: str) -> "TrainedPolicy":
         """The policy of one agent of a collection."""
+        weights = jax.tree.map(lambda leaf: jnp.asarray(leaf[place]), collection.weights_of(which, name))
         alone = of_one(collection, name, place, which)
         who = alone.agents[name][0]
-        weights = jax.tree.map(lambda leaf: jax.numpy.asarray(leaf[0]), alone.weights_of(which))
         greedy = partial(alone.algorithm(name).greedy, alone.hyper(name, who), weights)
         return cls(name, who, alone.n_devices, alone, jax.jit(greedy))
 
