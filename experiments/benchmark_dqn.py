@@ -22,52 +22,20 @@ def train_speed(n_agents: int, seconds: float) -> dict:
     """Environment steps/s of training with ``n_agents`` agents on a filled replay."""
     import jax
     import jax.numpy as jnp
-    import numpy as np
-    from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-    from uavmec_jax.learning.algorithm import AGENTS_AXIS
-    from uavmec_jax.learning.blocks import plan_blocks
-    from uavmec_jax.learning.population import Programs
-    from uavmec_jax.studies import host
-    from uavmec_jax.studies.study import make_agents, make_algorithm, parse_study, validation_keys
+    from uavmec_jax.studies.speed import training_speed
+    from uavmec_jax.studies.study import parse_study
 
-    study = parse_study(
-        f"steps = {2 * FILLED}\n[axes]\npowered = [8]\nconnected = [8]\nseeds = {n_agents}", "benchmark"
-    )
-    algorithm = make_algorithm(study)
-    blocks = plan_blocks(n_agents, algorithm.agent_bytes, host.free_memory())
-    mesh = Mesh(np.array(jax.local_devices()[: blocks.devices]), (AGENTS_AXIS,))
-    population = (make_agents(study), validation_keys(study))
-    take = lambda block: jax.device_put(  # noqa: E731
-        jax.tree.map(
-            lambda leaf: leaf[np.arange(block * blocks.size, (block + 1) * blocks.size) % n_agents], population
-        ),
-        NamedSharding(mesh, PartitionSpec(AGENTS_AXIS)),
-    )
-    tick = time.perf_counter()
-    programs = Programs.compile(algorithm, mesh, take(0))
-    compile_seconds = time.perf_counter() - tick
-    start, played = FILLED // algorithm.steps_per_iteration, 1000
+    axes = f"[axes]\npowered = [8]\nconnected = [8]\nseeds = {n_agents}"
+    study = parse_study(f"steps = {2 * FILLED}\n{axes}", "benchmark")
+    played = 1000
+    repeats = FILLED // played // 4
     fill = jax.jit(
-        lambda rows: rows.at[:, 1 : FILLED + 1].set(
-            jnp.tile(rows[:, 1 : 4 * played + 1], (1, FILLED // played // 4, 1))
-        ),
+        lambda rows: rows.at[:, 1 : FILLED + 1].set(jnp.tile(rows[:, 1 : 4 * played + 1], (1, repeats, 1))),
         donate_argnums=0,
     )
-    rates = []
-    for block in range(blocks.count):  # as in a real run: one block after the other
-        agents, _ = take(block)
-        state = programs.update(agents, programs.init(agents), np.int32(0), np.int32(played))
-        state = programs.update(agents, state.replace(rows=fill(state.rows)), np.int32(start), np.int32(start + 50))
-        jax.block_until_ready(state)
-        chunk, first, spent, deadline = 250, start + 50, 0.0, time.perf_counter() + seconds / blocks.count
-        while time.perf_counter() < deadline and first + chunk < algorithm.iterations:
-            tick = time.perf_counter()
-            state = jax.block_until_ready(programs.update(agents, state, np.int32(first), np.int32(first + chunk)))
-            spent += time.perf_counter() - tick
-            first += chunk
-        rates.append((first - start - 50) * algorithm.steps_per_iteration * min(blocks.size, n_agents) / spent)
-    return {"agents": n_agents, "steps_per_second": float(np.mean(rates)), "compile_seconds": compile_seconds}
+    prepare = lambda state: state.replace(rows=fill(state.rows))  # noqa: E731
+    return {"agents": n_agents} | training_speed(study, seconds, warm_up=played, start=FILLED // 4, prepare=prepare)
 
 
 def ceiling(agents_per_device: int, seconds: float) -> float:

@@ -8,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from click.testing import CliRunner
 
@@ -51,7 +52,7 @@ def test_help_does_not_import_jax():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert "run table5 --quick" in done.stdout
     assert done.stdout.strip().endswith("False")
-    for command in ("run", "plan", "show", "validate", "doctor"):
+    for command in ("run", "plan", "evaluate", "show", "compare", "validate", "doctor"):
         assert "Usage" in CliRunner().invoke(main, [command, "--help"]).stdout
 
 
@@ -127,6 +128,13 @@ def test_doctor():
         ),
         (["validate", "broken.toml"], "uavmec: broken.toml: not TOML"),
         (["show", "."], "uavmec: .: holds no run"),
+        (["evaluate", "oldest-frist"], "uavmec: oldest-frist: neither a file nor a policy by name; did you mean 'old"),
+        (["evaluate", "broken.toml"], "uavmec: broken.toml: cannot be read: "),
+        (["evaluate", "."], "uavmec: weights.npz: cannot be read: "),
+        (["evaluate", "random", "--powered", "13"], "uavmec: --powered is 13; give 0 to 12, the number of devices"),
+        (["evaluate", "random", "--save", "p.npz", "--draws", "2"], "uavmec: --save p.npz: random is a rule; only"),
+        (["evaluate", "random", "--agent", "seed"], "uavmec: --agent seed: give NAME=VALUE, e.g. algorithm=dqn"),
+        (["compare", ".", "."], "uavmec: .: holds no run"),
     ],
     ids=lambda value: value[-1] if isinstance(value, list) else "",
 )
@@ -180,3 +188,37 @@ def test_ctrl_c_says_what_is_kept(tmp_path):
     assert process.returncode == 130
     assert "interrupted: no block was finished, nothing was kept" in errors
     assert not (Path(tmp_path) / "out").exists()
+
+
+def test_evaluate_an_agent_of_a_run(run_directory, tmp_path):
+    directory, _ = run_directory
+    place = ["--powered", "12", "--connected", "8", "--seed", "1", "--draws", "4"]
+    saved = ["--save", str(tmp_path / "policy.npz")]
+    told = json.loads(CliRunner().invoke(main, ["evaluate", str(directory), *place, *saved, "--json"]).stdout)
+    assert told["trained_on"] == {"seed": 1, "powered": 12, "connected": 8}
+    mine, oldest, _ = told["policies"]
+    agents = pd.read_csv(directory / "agents.csv").query("seed == 1 and powered == 12")
+    assert mine["mean"] == agents["best_lifetime"].item()
+    assert oldest["mean"] == agents["oldest_first_lifetime"].item()
+    again = CliRunner().invoke(main, ["evaluate", str(tmp_path / "policy.npz"), *place]).stdout
+    assert "Trained by DQN on seed 1, powered 12, connected 8." in again
+    assert "another town" not in again
+    elsewhere = CliRunner().invoke(main, ["evaluate", str(tmp_path / "policy.npz"), "--draws", "4"]).stdout
+    assert "another town" in elsewhere
+    nobody = CliRunner().invoke(main, ["evaluate", str(directory), "--seed", "9"])
+    assert nobody.exit_code == 2
+    assert nobody.stderr.endswith("none of the 4 agents has powered=8, connected=8, seed=9\n")
+
+
+def test_compare_a_run_with_itself(run_directory):
+    directory = str(run_directory[0])
+    told = json.loads(CliRunner().invoke(main, ["compare", directory, directory, "--json"]).stdout)
+    assert told["overall"]["difference"]["value"] == 0
+    assert told["overall"]["improvement"]["value"] == 0.5
+    shown = CliRunner().invoke(main, ["compare", directory, directory, "--policy-b", "oldest-first"]).stdout
+    assert "probability that B lives longer than A" in shown
+    bad = CliRunner().invoke(main, ["compare", directory, directory, "--policy-b", "bset"])
+    assert (bad.exit_code, bad.stderr) == (
+        2,
+        "uavmec: my: has no policy 'bset'; it has best, last, stay-put, oldest-first\n",
+    )

@@ -3,10 +3,11 @@
 import jax
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
 from uavmec_jax.errors import StudyError
 from uavmec_jax.studies import study as studies
+from uavmec_jax.studies.paper import TABLE6
 from uavmec_jax.studies.study import (
     evaluation_keys,
     identities,
@@ -15,9 +16,11 @@ from uavmec_jax.studies.study import (
     make_algorithm,
     n_agents,
     parse_study,
+    parts,
     study_toml,
     validation_keys,
 )
+from uavmec_jax.world.rewards import REWARDS
 
 SMALL = """
 steps = 400
@@ -33,7 +36,7 @@ def test_shipped_studies_are_valid_and_round_trip(name):
     study = load_study(name)
     assert study.name == name
     assert parse_study(study_toml(study), "again") == study
-    assert n_agents(study) == len(identities(study)) == (2500 if name == "planning" else 250)
+    assert n_agents(study) == len(identities(study)) == {"planning": 2500, "table6": 675}.get(name, 250)
 
 
 def test_table5_is_the_paper():
@@ -133,7 +136,28 @@ BAD = [
     ({"reward": "U+log(A/0)"}, "bad.toml: reward is 'U+log(A/0)', which is not a reward; did you mean 'U+log(A/O)'?"),
     ({"reward": {"Q": 1.0}}, "bad.toml: reward has the term 'Q', which is not one"),
     ({"guard": "none"}, "bad.toml: guard is 'none'; it should be 'clamp' or 'log1p'"),
-    ({"algorithm": "sarsa"}, "bad.toml: algorithm is 'sarsa'; it should be 'dqn' or 'none'"),
+    ({"algorithm": "sarsa"}, "bad.toml: algorithm is 'sarsa'; it should be 'dqn', 'ppo', 'a2c' or 'none'"),
+    ({"axes.algorithm": ["dqn", "sarsa"]}, "bad.toml: axes.algorithm has 'sarsa'; known: dqn, ppo, a2c"),
+    ({"axes.algorithm": "dqn"}, "bad.toml: axes.algorithm is 'dqn'; give a list"),
+    ({"algorithm": "none", "axes.algorithm": ["dqn"]}, "bad.toml: axes.algorithm is given, but algorithm is 'none'"),
+    ({"dqn.clip_range": 0.1}, "bad.toml: dqn.clip_range is not a setting; "),
+    (
+        {"axes.clip_range": [0.1, 0.2]},
+        "bad.toml: axes.clip_range is not a hyperparameter of dqn, which has learning_rate, gamma, exploration_initial",
+    ),
+    (
+        {"axes.tau": [0.1], "axes.algorithm": ["ppo", "dqn"]},
+        "bad.toml: axes.tau is not a hyperparameter of ppo, which has learning_rate, gamma, gae_lambda, ent_coef",
+    ),
+    ({"ppo.clip_range": 0.1}, "bad.toml: ppo has settings, but the study trains dqn; leave them out"),
+    (
+        {"algorithm": "ppo", "ppo.batch_size": 100},
+        "bad.toml: ppo.batch_size is 100; it should divide n_steps * n_envs = 2048",
+    ),
+    ({"algorithm": "a2c", "a2c.gae_lambda": 1.5}, "bad.toml: a2c.gae_lambda is 1.5; it should be less than or equal"),
+    ({"dqn.n_step": 0}, "bad.toml: dqn.n_step is 0; it should be greater than or equal to 1"),
+    ({"dqn.tau": 0.0}, "bad.toml: dqn.tau is 0.0; it should be greater than 0"),
+    ({"axes.cells": [[8, 8]]}, "bad.toml: axes.cells stands beside axes.powered or axes.connected; give"),
     (
         {"evaluation.planners": ["oracle"]},
         "bad.toml: evaluation.planners.0 is 'oracle'; it should be 'rollout', 'beam'",
@@ -173,3 +197,63 @@ def test_not_toml_and_not_there(tmp_path):
     (tmp_path / "latin.toml").write_bytes(b"name = '\xe9'")
     with pytest.raises(StudyError, match="cannot be read"):
         load_study(tmp_path / "latin.toml")
+
+
+CELLS = "[axes]\ncells = [[6, 6], [10, 8]]\nseeds = [0, 2]\n"
+
+
+@pytest.mark.parametrize(
+    ("cells", "message"),
+    [
+        ("[[6, 13]]", "axes.cells has 13; give whole numbers from 0 to 12"),
+        ("[[6]]", r"axes.cells has \[6\]; give pairs \[powered, connected\]"),
+        ("[[6, 6], [6, 6]]", "axes.cells repeats a value"),
+        ("3", "axes.cells is 3; give a list"),
+    ],
+)
+def test_bad_cells(cells, message):
+    with pytest.raises(StudyError, match=message):
+        parse_study(f"[axes]\nseeds = 1\ncells = {cells}", "x")
+
+
+def test_cells_are_pairs():
+    study = parse_study(CELLS, "x")
+    who = identities(study)
+    assert [(one["seed"], one["powered"], one["connected"]) for one in who] == [
+        (0, 6, 6), (0, 10, 8), (2, 6, 6), (2, 10, 8)
+    ]  # fmt: skip
+    assert n_agents(study) == 4
+    assert parse_study(study_toml(study), "again") == study
+
+
+def test_algorithms_are_cut_into_parts_of_one_program_each():
+    study = parse_study(CELLS, "x", {"axes.algorithm": ["a2c", "dqn"], "axes.gamma": [0.9, 0.98], "a2c.vf_coef": 0.3})
+    assert n_agents(study) == len(identities(study)) == 16
+    assert [one["algorithm"] for one in identities(study)] == ["a2c"] * 8 + ["dqn"] * 8
+    a2c, dqn = parts(study)
+    assert (make_algorithm(a2c).name, make_algorithm(dqn).name) == ("a2c", "dqn")
+    agents, others = make_agents(a2c), make_agents(dqn)
+    assert_array_equal(agents.hyper.gamma, np.tile(np.float32([0.9, 0.98]), 4))
+    assert_allclose(agents.hyper.vf_coef, 0.3)
+    # the same towns, draws and keys, whoever learns
+    assert_array_equal(agents.scenario.layout.position, others.scenario.layout.position)
+    assert_array_equal(jax.random.key_data(agents.key), jax.random.key_data(others.key))
+    assert parse_study(study_toml(study), "again") == study
+
+
+def test_a_reward_without_ages_in_logarithms_has_one_guard():
+    rewards = ["A", "log A", "log M", {"log O": -1.0}]
+    study = parse_study(CELLS, "x", {"axes.reward": rewards[:3], "axes.guard": ["log1p", "clamp"]})
+    pairs = {(one["reward"], one["guard"]) for one in identities(study)}
+    assert pairs == {("A", "log1p"), ("log A", "log1p"), ("log A", "clamp"), ("log M", "log1p")}
+    assert n_agents(study) == len(identities(study)) == 4 * 4
+    assert not make_agents(study).scenario.reward.log1p.all()
+
+
+def test_table6_is_the_papers_table():
+    study = load_study("table6")
+    assert n_agents(study) == 3 * 3 * 5 * (11 + 4)
+    assert study.axes["reward"] == list(REWARDS)
+    wanted = {(one["reward"], one["powered"], one["connected"], one["algorithm"]) for one in identities(study)}
+    assert wanted == set(TABLE6)
+    assert max(TABLE6.values()) == 30  # U+log(A/O), 10 powered, 8 connected, DQN

@@ -1,14 +1,21 @@
-"""How fast the environment is on this machine."""
+"""How fast the environment and the learners are on this machine."""
 
 import time
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from uavmec_jax.learning.algorithm import AGENTS_AXIS
+from uavmec_jax.learning.blocks import plan_blocks
+from uavmec_jax.learning.population import Programs
+from uavmec_jax.studies import host
+from uavmec_jax.studies.schema import Study
+from uavmec_jax.studies.study import make_agents, make_algorithm, n_agents, validation_keys
 from uavmec_jax.world.environment import Scenario, advance, draw_volumes, make_scenario, restart_if
 from uavmec_jax.world.layout import sample_layout
 from uavmec_jax.world.params import Params
@@ -56,3 +63,56 @@ def environment_speed(n_layouts: int = 4096, seconds: float = 2.0) -> float:
         states, _ = jax.block_until_ready(run(states, keys, chunk))
         best = max(best, n_layouts * chunk / (time.perf_counter() - tick))
     return best
+
+
+def training_speed(
+    study: Study,
+    seconds: float,
+    *,
+    warm_up: int = 2,
+    start: int | None = None,
+    prepare: Callable[[Any], Any] = lambda state: state,
+) -> dict[str, float]:
+    """Environment steps per second of training a study's population, block after block as in a real run.
+
+    Args:
+        study: of one algorithm.
+        seconds: of measurement, for all blocks together.
+        warm_up: iterations before the clock starts.
+        start: iteration at which the clock starts; by default where the warm-up ended.
+        prepare: applied to the state between the two, e.g. to fill a replay memory.
+
+    Returns:
+        ``steps_per_second`` and ``compile_seconds``.
+    """
+    algorithm, n = make_algorithm(study), n_agents(study)
+    assert algorithm is not None
+    blocks = plan_blocks(n, algorithm.agent_bytes, host.free_memory())
+    mesh = Mesh(np.array(jax.local_devices()[: blocks.devices]), (AGENTS_AXIS,))
+    everyone = (make_agents(study), validation_keys(study))
+
+    def members(block: int) -> Any:
+        places = np.arange(block * blocks.size, (block + 1) * blocks.size) % n
+        sharding = NamedSharding(mesh, PartitionSpec(AGENTS_AXIS))
+        return jax.device_put(jax.tree.map(lambda leaf: leaf[places], everyone), sharding)
+
+    tick = time.perf_counter()
+    programs = Programs.compile(algorithm, mesh, members(0))
+    compile_seconds = time.perf_counter() - tick
+    chunk, rates = max(1, 1000 // algorithm.steps_per_iteration), []
+    for block in range(blocks.count):
+        agents, _ = members(block)
+        state = prepare(programs.update(agents, programs.init(agents), np.int32(0), np.int32(warm_up)))
+        first = warm_up if start is None else start
+
+        def train_chunk(state: Any, first: int, agents: Any = agents) -> Any:
+            return jax.block_until_ready(programs.update(agents, state, np.int32(first), np.int32(first + chunk)))
+
+        state = train_chunk(state, first)  # into the caches
+        chunks, begun = 0, time.perf_counter()
+        while chunks == 0 or time.perf_counter() - begun < seconds / blocks.count:
+            chunks += 1
+            state = train_chunk(state, first + chunks * chunk)
+        steps = chunks * chunk * algorithm.steps_per_iteration * min(blocks.size, n)
+        rates.append(steps / (time.perf_counter() - begun))
+    return {"steps_per_second": float(np.mean(rates)), "compile_seconds": compile_seconds}

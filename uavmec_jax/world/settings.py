@@ -89,7 +89,9 @@ def one_line(source: str, error: pydantic.ValidationError, root: type[BaseModel]
         for part in first["loc"][:-1]:
             parent = parent.model_fields[part].annotation if part in getattr(parent, "model_fields", {}) else None
         known = getattr(parent, "model_fields", {})
-        return f"{source}: {place} is not a setting; {nearest(str(first['loc'][-1]), known)}"
+        hint = nearest(str(first["loc"][-1]), known)
+        everything = "" if parent is root or hint.startswith("known") else f" known: {', '.join(known)}"
+        return f"{source}: {place} is not a setting; {hint}{everything}"
     if first["type"] == "missing":
         return f"{source}: {place} is missing"
     return f"{source}: {place} is {first['input']!r}; {wanted(first)}"
