@@ -55,6 +55,7 @@ def sb3_speed(algorithm: str, processes: int, seconds: float) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=10.0, help="length of each measurement")
+    parser.add_argument("--agents", type=int, nargs="+", default=AGENTS, help="sizes of the population")
     parser.add_argument("--out", type=Path, help="folder for benchmark_on_policy.json")
     parser.add_argument("--sb3-worker", choices=ALGORITHMS, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -83,7 +84,7 @@ def main() -> None:
         if has_sb3:
             table.add_row(f"Stable-Baselines3 {algorithm.upper()}, one process", f"{one:,.0f}", "1.0", "")
             table.add_row(f"Stable-Baselines3, {facts['cores']} processes", f"{every:,.0f}", against(every), "")
-        for agents, n_envs in (*((n, 1) for n in AGENTS), (8, 16)):
+        for agents, n_envs in (*((n, 1) for n in arguments.agents), (8, 16)):
             row = train_speed(algorithm, agents, arguments.seconds, n_envs)
             report["training"].append(row)
             name = f"this package, {agents} agent{'s' * (agents > 1)}{f' x {n_envs} environments' * (n_envs > 1)}"

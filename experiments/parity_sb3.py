@@ -10,6 +10,7 @@ in tests/learning/test_parity.py read the files; versions are in versions.json.
 import argparse
 import json
 import os
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import metadata
@@ -24,6 +25,7 @@ import numpy as np
 import torch
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common import logger
+from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.dqn import dqn as sb3_dqn
 
 import uavmec_jax.interop  # noqa: F401  (registers UavMec-v0)
@@ -185,6 +187,7 @@ def main() -> None:
     out = parser.parse_args().out
     out.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
+    warnings.simplefilter("error")
     made = {
         "dqn": dqn_updates(),
         "ppo": ppo_epoch(),
@@ -196,7 +199,9 @@ def main() -> None:
         np.savez_compressed(out / f"{name}.npz", **arrays)
         print(f"{name}: {len(arrays)} arrays, {(out / f'{name}.npz').stat().st_size / 1024:.0f} KiB")
     packages = ("stable-baselines3", "torch", "gymnasium", "numpy", "jax")
+    check_env(environment().unwrapped)  # raises, or warns, if it finds anything
     facts = {
+        "check_env": "passed",
         "command": "uv run --group sb3 python experiments/parity_sb3.py --out tests/golden/sb3",
         "versions": {name: metadata.version(name) for name in packages},
         "order": order_of_events(),

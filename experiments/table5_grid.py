@@ -19,17 +19,18 @@ from uavmec_jax.studies.run import run_study  # noqa: E402
 from uavmec_jax.studies.study import load_study  # noqa: E402
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--study", default="table5")
-    parser.add_argument("--seeds", type=int, default=10)
+def run(study: str, seeds: int, about: str) -> None:
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--study", default=study)
+    parser.add_argument("--seeds", type=int, default=seeds)
     parser.add_argument("--steps", type=int, default=1_000_000)
-    parser.add_argument("--out", type=Path, default=Path("runs/table5-grid"))
+    parser.add_argument("--out", type=Path, help="default: runs/<study>-script")
     arguments = parser.parse_args()
+    out = arguments.out or Path("runs") / f"{arguments.study}-script"
 
-    study = load_study(arguments.study, {"axes.seeds": arguments.seeds, "steps": arguments.steps})
-    results = run_study(study, arguments.out)
-    figures.save(figures.grid_figure(results), arguments.out / "figure.png")
+    overrides = {"axes.seeds": arguments.seeds, "steps": arguments.steps}
+    results = run_study(load_study(arguments.study, overrides), out)
+    figures.save(figures.run_figure(results), out / "figure.png")
     console = Console()
     for title, table in tables.tables(results).items():
         console.print(title)
@@ -37,4 +38,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run("table5", seeds=10, about=__doc__)

@@ -26,6 +26,20 @@ def test_table5_grid(tmp_path):
     assert (tmp_path / "grid" / "figure.png").exists()
 
 
+def test_table6_rewards(tmp_path):
+    out = run("table6_rewards.py", "--seeds", 1, "--steps", 400, "--out", tmp_path / "table6")
+    assert "8 powered, 8 connected: lifetime in slots" in out
+    assert (tmp_path / "table6" / "figure.png").exists()
+
+
+def test_benchmark_on_policy(tmp_path):
+    run("benchmark_on_policy.py", "--seconds", 0.1, "--agents", 2, "--out", tmp_path)
+    report = json.loads((tmp_path / "benchmark_on_policy.json").read_text())
+    found = [(row["algorithm"], row["agents"], row["n_envs"]) for row in report["training"]]
+    assert found == [("ppo", 2, 1), ("ppo", 8, 16), ("a2c", 2, 1), ("a2c", 8, 16)]
+    assert all(row["steps_per_second"] > 0 for row in report["training"])
+
+
 def test_figure3_training(tmp_path):
     run("figure3_training.py", "--steps", 60_000, "--out", tmp_path)
     assert (tmp_path / "figure3.png").stat().st_size > 20_000

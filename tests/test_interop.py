@@ -27,12 +27,6 @@ def test_gymnasium_checks_it(env):
     check_env(env.unwrapped)
 
 
-def test_stable_baselines3_checks_it(env):
-    """Where the group `sb3` is installed; experiments/parity_sb3.py notes the outcome in the golden files."""
-    checker = pytest.importorskip("stable_baselines3.common.env_checker")
-    checker.check_env(env.unwrapped)
-
-
 def test_an_episode_is_the_transition_of_the_model(env):
     scenario = env.unwrapped.scenario
     observation, info = env.reset(seed=3)

@@ -185,6 +185,10 @@ def test_initial_weights_come_from_the_same_distribution(name, layers):
             assert stats.ks_2samp(mine, their).pvalue > 1e-3, layer
 
 
+def test_their_environment_checker_passed_ours():
+    assert json.loads((GOLDEN / "versions.json").read_text())["check_env"] == "passed"
+
+
 def test_order_of_target_copies_and_gradient_steps():
     facts = json.loads((GOLDEN / "versions.json").read_text())
     spec = dqn.DQNSpec(total_steps=10_008)

@@ -1,0 +1,61 @@
+"""The paper's Table 6 from results: numbers in their places."""
+
+import io
+
+import numpy as np
+import pandas as pd
+import pytest
+from rich.console import Console
+
+from uavmec_jax.reporting import figures
+from uavmec_jax.reporting.table6 import is_table6, label_rewards
+from uavmec_jax.reporting.tables import tables
+from uavmec_jax.studies.results import Results
+from uavmec_jax.studies.study import identities, load_study
+
+
+@pytest.fixture(scope="module")
+def results():
+    """Every agent of the shipped study with an invented life: PPO on "A" in 8/8 lives 21 to 25 slots, all others 12."""
+    study = load_study("table6")
+    agents = pd.DataFrame(identities(study))
+    chosen = (agents.algorithm == "ppo") & (agents.reward == "A") & (agents.powered == 8)
+    lifetime = np.where(chosen, 21.0 + agents.seed, 12.0)
+    columns = {}
+    for policy, less in (("best", 0.0), ("last", 1.0), ("oldest_first", 2.0)):
+        columns |= {f"{policy}_lifetime": lifetime - less, f"{policy}_lifetime_fixed": lifetime - less}
+    share = np.zeros((len(agents), 2, 12), np.float32)
+    evaluation = {f"{policy}/first_failure": share for policy in ("best", "last", "oldest_first")}
+    curves = {"dqn": {"chunk_steps": np.arange(2)}}
+    return Results(study=study, run={}, agents=agents.assign(**columns), curves=curves, evaluation=evaluation)
+
+
+def test_each_place_is_a_table_like_the_papers(results):
+    assert is_table6(results)
+    shown = tables(results)
+    titles = list(shown)
+    assert [title.split(":")[0] for title in titles[:3]] == [
+        "6 powered, 6 connected",
+        "8 powered, 8 connected",
+        "10 powered, 8 connected",
+    ]
+    table = shown[titles[1]]
+    assert table.row_count == 15
+    console = Console(width=120, record=True, file=io.StringIO())
+    console.print(table)
+    text = console.export_text()
+    assert "23.0 ±1.2, 25.0 / 19" in text  # mean 23 of 21..25, longest 25; the paper has 19 for A, PPO, 8/8
+    assert "12.0 ±0.0, 12.0 / 28" in text  # the paper's DQN on U+log(A/O)
+    assert "22.0" in text  # last
+    assert "U+log(A/O)  (log1p)" in text
+
+
+def test_rewards_under_a_second_guard_say_so(results):
+    labels = label_rewards(results.cells())
+    assert sum("(log1p)" in label for label in labels) == 4 * 9
+    assert "A" in labels
+
+
+def test_figure(results, tmp_path):
+    figures.save(figures.run_figure(results), tmp_path / "figure.png")
+    assert (tmp_path / "figure.png").stat().st_size > 20_000
