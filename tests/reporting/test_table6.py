@@ -59,3 +59,15 @@ def test_rewards_under_a_second_guard_say_so(results):
 def test_figure(results, tmp_path):
     figures.save(figures.run_figure(results), tmp_path / "figure.png")
     assert (tmp_path / "figure.png").stat().st_size > 20_000
+
+
+def test_an_interrupted_run_has_holes(results):
+    part = Results(
+        study=results.study,
+        run={},
+        agents=results.agents.iloc[:250],
+        curves=results.curves,
+        evaluation={name: leaf[:250] for name, leaf in results.evaluation.items()},
+    )
+    assert [table.row_count for table in tables(part).values()] == [15, 15, 15, 3]
+    assert figures.run_figure(part) is not None

@@ -52,8 +52,11 @@ def table6_table(cells: pd.DataFrame) -> Table:
     keyed: Any = cells.set_index(["algorithm", "reward_shown"], drop=False)
     highest = {algorithm: keyed.loc[algorithm]["best"].max() for algorithm in algorithms}
     for shown in dict.fromkeys(cells["reward_shown"]):
-        found = [keyed.loc[(algorithm, shown)] for algorithm in algorithms]
-        table.add_row(shown, *(_entry(cell, highest[cell["algorithm"]]) for cell in found))
+        entries = [
+            _entry(keyed.loc[(algorithm, shown)], highest[algorithm]) if (algorithm, shown) in keyed.index else Text("")
+            for algorithm in algorithms  # an interrupted run has holes
+        ]
+        table.add_row(shown, *entries)
     return table
 
 

@@ -1,0 +1,108 @@
+"""Studies of several algorithms, and of rewards that are functions."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.testing import assert_array_equal
+
+from uavmec_jax.errors import StudyError
+from uavmec_jax.learning.population import Progress
+from uavmec_jax.studies.evaluation import Distinct, Judgement
+from uavmec_jax.studies.results import load_results, load_weights
+from uavmec_jax.studies.run import plan_study, run_study
+from uavmec_jax.studies.study import parse_study
+
+TOML = """
+name = "three"
+steps = 640
+[axes]
+algorithm = ["dqn", "ppo", "a2c"]
+cells = [[8, 8], [6, 6]]
+seeds = 2
+reward = ["U", "U+log(A/O)"]
+guard = ["clamp", "log1p"]
+[dqn]
+hidden = [16]
+[ppo]
+hidden = [16]
+n_steps = 64
+n_envs = 2
+[a2c]
+hidden = [16]
+[evaluation]
+draws = 3
+validate_every = 320
+validation_draws = 2
+planner_draws = 2
+planners = ["rollout", "bound"]
+baselines = ["oldest-first"]
+"""
+
+
+@pytest.mark.slow
+def test_one_study_trains_each_algorithm_as_one_program(tmp_path):
+    study = parse_study(TOML, "three")
+    plan = plan_study(study)
+    assert plan.agents == 3 * 2 * 2 * 3  # the reward U has one guard
+    assert list(plan.blocks) == ["dqn", "ppo", "a2c"]
+    news: list[Progress] = []
+    results = run_study(study, tmp_path / "run", on_progress=news.append)
+    assert results.run["complete"]
+    assert [one.steps for one in news] == sorted(one.steps for one in news)
+    assert news[-1].steps == news[-1].of_steps == plan.total_steps == results.run["environment_steps"]
+    assert {one.block for one in news} == {0, 1, 2}
+    assert results.agents["algorithm"].tolist() == ["dqn"] * 12 + ["ppo"] * 12 + ["a2c"] * 12
+    assert results.agents.groupby("algorithm")["steps"].first().to_dict() == {"dqn": 640, "ppo": 640, "a2c": 640}
+    # what nobody learned is the same for all agents of a scenario
+    for column in ("oldest_first_lifetime", "rollout_planned", "bound_planned"):
+        assert (results.agents.groupby(["seed", "powered", "connected"])[column].nunique() == 1).all()
+    assert (results.agents["bound_planned"] >= results.agents["best_planned"]).all()
+
+    again = load_results(tmp_path / "run")
+    assert list(again.curves) == ["dqn", "ppo", "a2c"]
+    assert again.curves["ppo"]["validation"].shape == (12, 2)
+    assert "critic" in load_weights(tmp_path / "run", algorithm="a2c")["params"]
+    pd.testing.assert_frame_equal(again.cells(), results.cells(), rtol=1e-4)
+
+    text = TOML.replace('["dqn", "ppo", "a2c"]', '["ppo"]')
+    for other in ("dqn", "a2c"):
+        text = text.replace(f"[{other}]\nhidden = [16]\n", "")
+    alone = run_study(parse_study(text, "alone"))
+    mine = results.agents.query("algorithm == 'ppo'").reset_index(drop=True)
+    pd.testing.assert_frame_equal(alone.agents, mine)
+
+
+@pytest.mark.slow
+def test_a_function_is_a_reward_for_a_whole_study():
+    few = {"axes.powered": [8], "axes.connected": [8], "axes.seeds": 2, "steps": 400}
+    settings = (
+        "[evaluation]\nplanners = []\nbaselines = []\ndraws = 3\nvalidate_every = 200\nvalidation_draws = 2\n[axes]\n"
+    )
+    study = parse_study(settings, "mine", few)
+
+    def product(terms):
+        return terms["U"] * terms["M"]
+
+    results = run_study(study, reward=product)
+    assert results.run["reward_function"].endswith("product")
+    linear = run_study(study)
+    assert "reward_function" not in linear.run
+    mine, theirs = (r.weights["dqn/last/params/TorchDense_0/kernel"] for r in (results, linear))
+    assert (mine != theirs).any()
+
+
+def test_a_function_beside_an_axis_of_rewards_is_refused():
+    study = parse_study("[axes]\npowered = [8]\nconnected = [8]\nseeds = 1\nreward = ['A', 'U']", "two")
+    with pytest.raises(StudyError, match=r"two: axes.reward is given, and a reward function too"):
+        run_study(study, reward=lambda terms: terms["A"])
+
+
+def test_distinct_scenarios():
+    played = pd.DataFrame({"seed": [1, 1, 0, 1], "powered": [8, 6, 8, 8]})
+    distinct = Distinct.of(played)
+    assert_array_equal(distinct.first, [0, 1, 2])
+    assert_array_equal(distinct.scenario, [0, 1, 2, 0])
+    assert_array_equal(distinct.longest(np.array([[3, 1], [5, 5], [2, 2], [1, 4]])), [[3, 4], [5, 5], [2, 2]])
+    judged = Judgement(np.array([[7, 8], [9, 9], [1, 2]]), np.zeros((3, 2), np.int8), np.zeros((3, 2, 4)))
+    assert_array_equal(distinct.to_agents(judged).lifetime, [[7, 8], [9, 9], [1, 2], [7, 8]])
+    assert distinct.to_agents(judged).first_failure.shape == (4, 2, 4)
