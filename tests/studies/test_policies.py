@@ -1,5 +1,6 @@
 """Saved policies: what comes back acts as what was trained, and what was tampered with is refused in one line."""
 
+import itertools
 import json
 
 import jax
@@ -12,42 +13,56 @@ from numpy.testing import assert_allclose, assert_array_equal
 import uavmec_jax as um
 from tests.studies.test_run import TOML as TINY
 from uavmec_jax.errors import PolicyError
-from uavmec_jax.learning import ppo
+from uavmec_jax.learning import dqn, ppo
 from uavmec_jax.planning.heuristics import HEURISTICS
-from uavmec_jax.studies.collection import Collection
+from uavmec_jax.studies.collection import Collection, write_collection
 from uavmec_jax.studies.policies import TrainedPolicy, load_policy
 from uavmec_jax.studies.run import run_study
-from uavmec_jax.studies.schema import PPOSettings
+from uavmec_jax.studies.schema import DQNSettings, PPOSettings
 from uavmec_jax.studies.study import held_out_draws, parse_study, town
 from uavmec_jax.world.environment import observe
 
 ONE = {"algorithm": "dqn", "powered": 12, "connected": 4, "seed": 1}
 
 
+def collection_of(name, network, settings, agents):
+    """A collection with random weights, best and last."""
+    make = jax.jit(jax.vmap(lambda key: network.init(key, jnp.zeros((1, 24)))))
+    kinds = {kind: make(jax.random.split(jax.random.key(i), len(agents))) for i, kind in enumerate(("best", "last"))}
+    weights = traverse_util.flatten_dict({name: kinds}, sep="/")
+    return Collection(
+        settings={name: settings.model_dump(mode="json")},
+        n_devices=12,
+        agents={name: agents},
+        weights={key: np.asarray(leaf) for key, leaf in weights.items()},
+    )
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    directory = tmp_path_factory.mktemp("policies") / "run"
-    return run_study(parse_study(TINY, "tiny"), directory), directory
+    """The folder of a run of eight DQN agents, as far as policies need it."""
+    directory = tmp_path_factory.mktemp("run")
+    places = itertools.product((0, 1), (12, 4), (12, 4))
+    agents = [dict(zip(("seed", "powered", "connected"), place, strict=True)) for place in places]
+    write_collection(
+        directory / "weights.npz",
+        collection_of("dqn", dqn.DQNSpec(hidden=(16,)).network, DQNSettings(hidden=(16,)), agents),
+    )
+    return directory
 
 
 @pytest.fixture(scope="module")
 def ppo_policy():
-    """A PPO policy on ages divided by ten; its weights are random."""
-    spec = ppo.PPOSpec(hidden=(16,))
-    weights = jax.vmap(lambda key: spec.network.init(key, jnp.zeros((1, 24))))(jax.random.split(jax.random.key(0), 3))
-    flat = traverse_util.flatten_dict({"ppo": {"best": weights}}, sep="/")
-    collection = Collection(
-        settings={"ppo": PPOSettings(hidden=(16,), age_scale=0.1).model_dump(mode="json")},
-        n_devices=12,
-        agents={"ppo": [{"seed": seed, "powered": 8, "connected": 8} for seed in range(3)]},
-        weights={name: np.asarray(leaf) for name, leaf in flat.items()},
-    )
-    return TrainedPolicy.of(collection, "ppo", 2, "best")
+    """A PPO policy on ages divided by ten."""
+    agents = [{"seed": seed, "powered": 8, "connected": 8} for seed in range(3)]
+    settings = PPOSettings(hidden=(16,), age_scale=0.1)
+    return TrainedPolicy.of(collection_of("ppo", ppo.PPOSpec(hidden=(16,)).network, settings, agents), "ppo", 2, "best")
 
 
-def test_an_agent_of_a_run_lives_as_long_as_the_table_says(run):
-    results, directory = run
-    policy = load_policy(directory, powered=4, connected=12, seed=1)
+@pytest.mark.slow
+def test_an_agent_of_a_run_lives_as_long_as_the_table_says(tmp_path):
+    results = run_study(parse_study(TINY, "tiny"), tmp_path / "run")
+    policy = load_policy(tmp_path / "run", powered=4, connected=12, seed=1)
     assert policy.trained_on == {"seed": 1, "powered": 4, "connected": 12}
     layout = town(1, um.Params(), 4, 12)
     played = jax.jit(lambda keys: um.rollouts(policy, um.Params(), layout, keys))(held_out_draws(1, 4, 12, 5))
@@ -57,7 +72,7 @@ def test_an_agent_of_a_run_lives_as_long_as_the_table_says(run):
 
 @pytest.mark.parametrize("kind", ["dqn", "ppo"])
 def test_batched_states_and_numpy_observations(run, ppo_policy, kind):
-    policy = ppo_policy if kind == "ppo" else load_policy(run[1], "last", powered=12, connected=4, seed=0)
+    policy = ppo_policy if kind == "ppo" else load_policy(run, "last", powered=12, connected=4, seed=0)
     layout = town(0, um.Params(), 12, 4)
     state = um.initial_state(um.Params(), layout)
     states = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (3, 2, *leaf.shape)), state)
@@ -99,25 +114,25 @@ def test_policies_by_name():
 )
 def test_which_agent(run, axes, message):
     with pytest.raises(PolicyError) as error:
-        load_policy(run[1], **axes)
-    assert str(error.value) == f"{run[1] / 'weights.npz'}: {message}"
+        load_policy(run, **axes)
+    assert str(error.value) == f"{run / 'weights.npz'}: {message}"
 
 
 def test_which_weights(run):
     with pytest.raises(PolicyError, match="there are no 'worst' weights of 'dqn'; there are best and last of dqn"):
-        um.load_policy(run[1], "worst", **ONE)
+        um.load_policy(run, "worst", **ONE)
 
 
 @pytest.mark.parametrize("shape", [(), (23,), (24, 3)])
 def test_observation_of_another_shape(run, shape):
-    policy = load_policy(run[1], **ONE)
+    policy = load_policy(run, **ONE)
     with pytest.raises(PolicyError) as error:
         policy.act(np.zeros(shape))
     assert str(error.value) == f"the observation has the shape {shape}; it should be (24,) or (..., 24)"
 
 
 def test_observation_that_is_none_and_another_number_of_devices(run):
-    policy = load_policy(run[1], **ONE)
+    policy = load_policy(run, **ONE)
     with pytest.raises(PolicyError, match="is not an array of numbers"):
         policy.act(["a", "b"])
     params = um.Params(n_devices=5)
@@ -157,7 +172,7 @@ ALTERED = [
 @pytest.mark.parametrize(("change", "message"), ALTERED, ids=[change.__name__ for change, _ in ALTERED])
 def test_altered_file(run, tmp_path, change, message):
     path = tmp_path / "mine.npz"
-    load_policy(run[1], **ONE).save(path)
+    load_policy(run, **ONE).save(path)
     rewritten(path, tmp_path / "other.npz", change)
     with pytest.raises(PolicyError) as error:
         load_policy(tmp_path / "other.npz")
@@ -166,7 +181,7 @@ def test_altered_file(run, tmp_path, change, message):
 
 def test_truncated_flipped_and_foreign_files(run, tmp_path):
     path = tmp_path / "mine.npz"
-    load_policy(run[1], **ONE).save(path)
+    load_policy(run, **ONE).save(path)
     whole = path.read_bytes()
     for broken in (whole[:-40], whole[: len(whole) // 2], b"", b"not a zip"):
         path.write_bytes(broken)

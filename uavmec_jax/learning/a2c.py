@@ -37,15 +37,7 @@ class A2CSpec(OnPolicySpec):
 
 def algorithm(spec: A2CSpec) -> Algorithm:
     """Bind the static settings."""
-    return Algorithm(
-        name="a2c",
-        iterations=spec.iterations,
-        steps_per_iteration=spec.steps_per_iteration,
-        agent_bytes=spec.agent_bytes,
-        init=partial(on_policy.init, spec, _OPTIMIZER),
-        update=partial(on_policy.update, partial(_iteration, spec)),
-        greedy=partial(on_policy.greedy, spec),
-    )
+    return on_policy.bind("a2c", spec, _OPTIMIZER, partial(_iteration, spec))
 
 
 def a2c_loss(spec: A2CSpec, hyper: A2CHyper, weights: Any, samples: Samples) -> Float[Array, ""]:

@@ -6,6 +6,7 @@ that the two differ in (:mod:`uavmec_jax.learning.ppo`, :mod:`uavmec_jax.learnin
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -14,7 +15,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from uavmec_jax.learning.algorithm import AGENTS_AXIS, Agent
+from uavmec_jax.learning.algorithm import AGENTS_AXIS, Agent, Algorithm
 from uavmec_jax.learning.networks import ActorCritic, n_weights, scale_ages
 from uavmec_jax.learning.optimizers import Descent
 from uavmec_jax.world.environment import advance, draw_volumes, is_truncated, observe, restart_if
@@ -123,6 +124,24 @@ class Samples(NamedTuple):
     log_prob: Array
 
 
+def bind(
+    name: str,
+    spec: OnPolicySpec,
+    optimizer: optax.GradientTransformationExtraArgs,
+    iteration: Callable[[Agent, OnPolicyState, Any], OnPolicyState],
+) -> Algorithm:
+    """An algorithm from what it learns by: ``iteration(agent, state, i)`` plays and learns once."""
+    return Algorithm(
+        name=name,
+        iterations=spec.iterations,
+        steps_per_iteration=spec.steps_per_iteration,
+        agent_bytes=spec.agent_bytes,
+        init=partial(init, spec, optimizer),
+        update=partial(_update, iteration),
+        greedy=partial(greedy, spec),
+    )
+
+
 def init(spec: OnPolicySpec, optimizer: optax.GradientTransformationExtraArgs, agent: Agent) -> OnPolicyState:
     """A fresh agent: orthogonal weights, a new episode in every environment."""
     observation = jnp.zeros((1, 2 * spec.n_devices))
@@ -139,7 +158,7 @@ def init(spec: OnPolicySpec, optimizer: optax.GradientTransformationExtraArgs, a
     )
 
 
-def update(
+def _update(
     iteration: Callable[[Agent, OnPolicyState, Any], OnPolicyState],
     agent: Agent,
     state: OnPolicyState,
@@ -223,7 +242,8 @@ def _slot(
 
     def with_cut_off() -> Array:
         final = over_envs(lambda world: observe(layout, world), after)
-        return reward + truncated * agent.hyper.gamma * value(spec, agent.hyper, state.weights, final)
+        worth = agent.hyper.gamma * value(spec, agent.hyper, state.weights, final)
+        return reward + jnp.where(truncated, worth, 0.0)
 
     cut = jax.lax.pmax(jnp.any(truncated), AGENTS_AXIS)  # a true branch: the predicate is the same for all agents
     reward = jax.lax.cond(cut, with_cut_off, lambda: reward)

@@ -50,15 +50,7 @@ def algorithm(spec: PPOSpec) -> Algorithm:
         raise ValueError(
             f"batch_size is {spec.batch_size}; it should divide n_steps * n_envs = {spec.steps_per_iteration}"
         )
-    return Algorithm(
-        name="ppo",
-        iterations=spec.iterations,
-        steps_per_iteration=spec.steps_per_iteration,
-        agent_bytes=spec.agent_bytes,
-        init=partial(on_policy.init, spec, _OPTIMIZER),
-        update=partial(on_policy.update, partial(_iteration, spec)),
-        greedy=partial(on_policy.greedy, spec),
-    )
+    return on_policy.bind("ppo", spec, _OPTIMIZER, partial(_iteration, spec))
 
 
 def ppo_loss(spec: PPOSpec, hyper: PPOHyper, weights: Any, batch: Samples) -> Float[Array, ""]:
