@@ -116,18 +116,21 @@ def table6_figure(results: Results) -> Figure:
     cells = results.cells()
     cells["reward"] = label_rewards(cells)
     cells["column"] = [
-        f"{ALGORITHM_NAMES[name]}\n{powered} / {connected}"
+        f"{ALGORITHM_NAMES[name]}\n{powered}/{connected}"
         for name, powered, connected in zip(cells.algorithm, cells.powered, cells.connected, strict=True)
     ]
-    order = [list(dict.fromkeys(cells[name])) for name in ("reward", "column")]
-    table = cells.pivot(index="reward", columns="column", values="best").loc[order[0], order[1]]
-    figure = new_figure(1.5 + 0.75 * len(order[1]), 1.2 + 0.33 * len(order[0]))
+    rows, columns = list(dict.fromkeys(cells["reward"])), cells.drop_duplicates("column")
+    places = columns.groupby(["powered", "connected"], sort=False)["column"]
+    order = [column for _, own in places for column in own]
+    table = cells.pivot(index="reward", columns="column", values="best").loc[rows, order]
+    figure = new_figure(3.2 + 0.75 * len(order), 1.2 + 0.33 * len(rows))
     axis = figure.subplots()
     image = _heat_map(axis, table, (10.0, max(33.0, float(cells["best"].max()))))
+    axis.set_aspect("auto")
     figure.colorbar(image, ax=axis, label="lifetime, slots", shrink=0.8)
     seeds = int(cells["seeds"].min())
     axis.set_title(
-        f"{results.study.name}: best weights, mean over {seeds} seeds; columns: powered / connected", fontsize=10
+        f"{results.study.name}: best weights, mean over {seeds} seeds; columns: powered/connected", fontsize=10
     )
     return figure
 

@@ -31,7 +31,7 @@ def label_rewards(cells: pd.DataFrame) -> list[str]:
 def table6_tables(cells: pd.DataFrame) -> dict[str, Table]:
     """The paper's table, one for each of its columns of cells, and those who learn nothing."""
     guard = f"; logarithms guarded by {cells['guard'].iloc[0]} where nothing else is said" if "guard" in cells else ""
-    how = f"best weights: mean over the seeds ± 95 %, maximum / the paper's maximum; below: last weights{guard}"
+    how = f"best weights: mean over the seeds ± 95 %; maximum / the paper's maximum; last weights{guard}"
     places = dict.fromkeys(zip(cells.powered, cells.connected, strict=True))
     return {
         f"{powered} powered, {connected} connected: lifetime in slots, {how}": table6_table(
@@ -64,7 +64,7 @@ def _entry(cell: Any, highest: float) -> Text:
     paper = TABLE6.get((cell["reward"], cell["powered"], cell["connected"], cell["algorithm"]))
     text = Text(f"{cell['best']:.1f}", style="bold" if cell["best"] == highest else "default")
     text.append(half_interval(cell["best_low"], cell["best_high"]), style="dim not bold")
-    text.append(f", {cell['best_max']:.1f}", style="not bold")
+    text.append(f"\n{cell['best_max']:.1f}", style="not bold")
     text.append(f" / {paper:g}" if paper is not None else " / -", style="not bold")
     text.append(f"\n{cell['last']:.1f}", style="dim not bold")
     return text.append(half_interval(cell["last_low"], cell["last_high"]), style="dim not bold")
