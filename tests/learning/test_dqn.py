@@ -135,6 +135,7 @@ def numpy_update(weights, target, batch, hyper):
     return loss, layers
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("max_grad_norm", [10.0, 0.01])
 def test_update_against_numpy(max_grad_norm):
     spec, hyper = DQNSpec(), DQNHyper(max_grad_norm=max_grad_norm, learning_starts=0)

@@ -18,6 +18,7 @@ from uavmec_jax.world.physics import initial_state
 
 A2C = a2c.algorithm(a2c.A2CSpec(total_steps=10_000))
 PPO = ppo.algorithm(ppo.PPOSpec(total_steps=10_000, n_steps=64, batch_size=16, n_epochs=2))
+BOTH = ["a2c", pytest.param("ppo", marks=pytest.mark.slow)]
 KINDS = {"a2c": (A2C, a2c.A2CHyper), "ppo": (PPO, ppo.PPOHyper)}
 
 
@@ -84,7 +85,7 @@ def test_a_cut_off_episode_is_bootstrapped():
     assert_allclose(difference, 0.5 * (whole.returns[1] - reward_and_value[1]), rtol=1e-4)
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", BOTH)
 def test_an_agent_is_itself_whoever_trains_beside_it(name):
     agents = population(name, {}, {"gamma": 0.9}, {"learning_rate": 1e-3})
     state, again = train(name, agents, 0, 12), train(name, agents, 0, 12)
@@ -97,7 +98,7 @@ def test_an_agent_is_itself_whoever_trains_beside_it(name):
     assert any((a[1] != b[1]).any() for a, b in zip(*map(jax.tree.leaves, (state, mixed)), strict=True))
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", BOTH)
 @pytest.mark.parametrize("bad", [{"learning_rate": np.inf}, {"gamma": np.nan}])
 def test_diverged_agent_is_frozen_marked_and_touches_nobody(name, bad):
     state = train(name, population(name, {}, bad, {}), 0, 12)

@@ -189,6 +189,7 @@ def test_their_environment_checker_passed_ours():
     assert json.loads((GOLDEN / "versions.json").read_text())["check_env"] == "passed"
 
 
+@pytest.mark.slow
 def test_order_of_target_copies_and_gradient_steps():
     facts = json.loads((GOLDEN / "versions.json").read_text())
     spec = dqn.DQNSpec(total_steps=10_008)

@@ -69,6 +69,7 @@ def test_what_a_block_leaves():
     assert set(block.seconds) == {"compile", "train", "validate"}
 
 
+@pytest.mark.slow
 def test_best_weights_are_those_of_the_best_look():
     agents = stack([make_agent(i) for i in range(2)])
     (block,), _ = train(agents)
@@ -102,6 +103,7 @@ def test_small_replay_wraps():
     assert np.isfinite(block.validation).all()
 
 
+@pytest.mark.slow
 def test_odd_train_frequency_and_widths():
     (block,), _ = train(stack([make_agent(0)]), steps=1001, train_frequency=3, hidden=(8,), batch_size=5)
     assert block.chunk_steps[-1] == 1002  # whole iterations

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from numpy.testing import assert_array_equal
 
-from uavmec_jax.errors import StudyError
+from uavmec_jax.errors import PolicyError, StudyError
 from uavmec_jax.reporting import figures, tables
 from uavmec_jax.studies import host
 from uavmec_jax.studies.results import load_results, load_weights
@@ -77,7 +77,7 @@ def test_read_back_equals_what_was_run(finished):
     assert results.evaluation["best/lifetime"].shape == (8, 6)
     kernel = load_weights(directory)["params"]["TorchDense_0"]["kernel"]
     assert_array_equal(kernel, results.weights["dqn/best/params/TorchDense_0/kernel"])
-    with pytest.raises(StudyError, match="holds no 'worst' weights"):
+    with pytest.raises(PolicyError, match="there are no 'worst' weights of 'dqn'; there are best and last of dqn"):
         load_weights(directory, "worst")
 
 
@@ -247,16 +247,24 @@ def test_flipped_bit_in_the_weights_is_found(finished, tmp_path):
         middle = len(data) // 2
         return data[:middle] + bytes([data[middle] ^ 1]) + data[middle + 1 :]
 
-    with pytest.raises(StudyError, match=r"weights.npz: cannot be read"):
+    with pytest.raises(PolicyError, match=r"weights.npz: cannot be read"):
         load_weights(damage(finished[1], tmp_path, "weights.npz", flip))
 
 
 def test_newer_schema_and_no_run(finished, tmp_path):
-    newer = damage(finished[1], tmp_path, "run.json", lambda data: data.replace(b'"schema": 1', b'"schema": 99'))
-    with pytest.raises(StudyError, match="schema is 99; this version reads up to 1"):
+    newer = damage(finished[1], tmp_path, "run.json", lambda data: data.replace(b'"schema": 2', b'"schema": 99'))
+    with pytest.raises(StudyError, match="schema is 99; this version reads up to 2"):
         load_results(newer)
     with pytest.raises(StudyError, match="holds no run"):
         load_results(tmp_path)
+
+
+def test_a_run_of_schema_1_can_be_read(finished, tmp_path):
+    older = damage(finished[1], tmp_path, "run.json", lambda data: data.replace(b'"schema": 2', b'"schema": 1'))
+    with np.load(older / "curves.npz") as curves:
+        np.savez(older / "curves.npz", **{name.removeprefix("dqn/"): curves[name] for name in curves.files})
+    again = load_results(older)
+    assert_array_equal(again.curves["dqn"]["validation"], finished[0].curves["dqn"]["validation"])
 
 
 def test_same_study_twice_is_equal_to_the_bit(finished):

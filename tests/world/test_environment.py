@@ -70,6 +70,7 @@ def test_everything_powered_and_connected_lives_33_slots():
     assert not episodes.failed.any()
 
 
+@pytest.mark.slow
 def test_nothing_powered_or_connected_lives_11_slots_without_shared_hover_points():
     params = Params(uav_signal_range_m=11.0)  # altitude 10 m: nobody within 4.6 m on the ground
     keys = jax.random.split(jax.random.key(0), 20)
@@ -116,6 +117,7 @@ def test_rollouts_differ_by_draw_and_repeat_by_key():
     assert durations[0] != durations[1]
 
 
+@pytest.mark.slow
 def test_jit_and_vmap_change_nothing():
     layouts = jax.vmap(lambda key: sample_layout(key, PARAMS, 6, 6))(jax.random.split(jax.random.key(0), 5))
     volumes = jax.random.uniform(jax.random.key(1), (5, 12), minval=2e6, maxval=4e6)
