@@ -60,7 +60,7 @@ def test_one_study_trains_each_algorithm_as_one_program(tmp_path):
 
     again = load_results(tmp_path / "run")
     assert list(again.curves) == ["dqn", "ppo", "a2c"]
-    assert again.curves["ppo"]["validation"].shape == (12, 2)
+    assert again.curves["ppo"]["validation"].shape == (12, 3)  # looks after 2, 4 and 5 rollouts of 128 steps
     assert "critic" in load_weights(tmp_path / "run", algorithm="a2c")["params"]
     pd.testing.assert_frame_equal(again.cells(), results.cells(), rtol=1e-4)
 
