@@ -14,6 +14,7 @@ import sys
 import time
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 DRAWS = 64
 
@@ -53,7 +54,7 @@ def sb3_worker(seeds: list[int], steps: int) -> None:
         print(json.dumps({"seed": seed, "lifetime": float(length.mean())}), flush=True)
 
 
-def layout():
+def layout() -> Any:
     """The one layout: what studies call seed 0 with 8 powered and 8 connected devices."""
     from uavmec_jax.studies.study import town
     from uavmec_jax.world.params import Params
@@ -61,7 +62,7 @@ def layout():
     return town(0, Params(), 8, 8)
 
 
-def draws():
+def draws() -> Any:
     """The volume draws that both are judged on."""
     from uavmec_jax.studies.study import held_out_draws
 

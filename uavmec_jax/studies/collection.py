@@ -85,7 +85,7 @@ class Collection:
             if axis not in known:
                 raise PolicyError(f"{axis!r} tells no agents apart; they have {', '.join(known)}")
         named = [(name, place, {"algorithm": name} | who) for name, place, who in everyone]
-        found = [one for one in named if all(one[2][axis] == value for axis, value in axes.items())]
+        found = [one for one in named if all(one[2].get(axis) == value for axis, value in axes.items())]
         if len(found) == 1:
             return found[0][:2]
         asked = ", ".join(f"{axis}={value}" for axis, value in axes.items()) or "anything"
@@ -148,7 +148,11 @@ def _check_shapes(path: Path, collection: Collection) -> None:
             raise PolicyError(f"{path}: its {name} is not one that this version knows: {error}") from None
         for which in {key.split("/")[1] for key in collection.weights if key.startswith(f"{name}/")}:
             prefix = f"{name}/{which}/"
-            found = {key.removeprefix(prefix): leaf.shape for key, leaf in collection.weights.items() if prefix in key}
+            found = {
+                key.removeprefix(prefix): leaf.shape
+                for key, leaf in collection.weights.items()
+                if key.startswith(prefix)
+            }
             if found != {key: (len(agents), *shape) for key, shape in wanted}:
                 raise PolicyError(f"{path}: its weights do not fit its {name} network of this version")
 

@@ -131,7 +131,7 @@ class Results:
         """The weights with all that is needed to make policies of them."""
         axes = ["seed", *cell_axes(self.study)]
         agents: dict[str, list[dict[str, Any]]] = {}
-        for row in json.loads(self.agents[axes].to_json(orient="records")):
+        for row in json.loads(self.agents[axes].to_json(orient="records", double_precision=15)):
             agents.setdefault(row.get("algorithm", self.study.algorithm), []).append(row)
         return Collection(
             settings={name: getattr(self.study, name).model_dump(mode="json") for name in self.study.algorithms},
