@@ -30,8 +30,7 @@ def plan(
     as_json: bool,
 ) -> None:
     """Plan for SCENARIO, a layout file (TOML or CSV), or for a random town: tours, bound, first failure, repairs."""
-    if scenario is not None and (powered, connected) != (None, None):
-        fail(f"{scenario}: says itself who has power and communication; leave out --powered and --connected")
+    town = _town(scenario, powered, connected)
     if not 1 <= width <= 100_000:
         fail(f"--width is {width}; give 1 to 100000 states")
     from uavmec_jax.studies import host
@@ -45,12 +44,7 @@ def plan(
     from uavmec_jax.studies.scenario import load_scenario
 
     inventory, keys = load_scenario(
-        scenario,
-        powered=8 if powered is None else powered,
-        connected=8 if connected is None else connected,
-        seed=seed,
-        draws=draws,
-        settings=dict(assignment(setting) for setting in settings),
+        scenario, **town, seed=seed, draws=draws, settings=dict(assignment(setting) for setting in settings)
     )
     directory = out or new_folder("plan")
     check_directory(directory)
@@ -96,9 +90,7 @@ def evaluate(
 
     Of a run it is by default the agent that learned in the town asked for.
     """
-    if scenario is not None and (powered, connected) != (None, None):
-        fail(f"{scenario}: says itself who has power and communication; leave out --powered and --connected")
-    town = {"powered": 8 if powered is None else powered, "connected": 8 if connected is None else connected}
+    town = _town(scenario, powered, connected)
     from rich.console import Console
 
     from uavmec_jax.reporting.compare import evaluation_table
@@ -141,3 +133,10 @@ def evaluate(
             console.print(
                 "This is another town: its observation names no places, so nothing it learned need hold here."
             )
+
+
+def _town(scenario: Path | None, powered: int | None, connected: int | None) -> dict[str, int]:
+    """How many devices of a random town have what; refuses counts beside a layout file."""
+    if scenario is not None and (powered, connected) != (None, None):
+        fail(f"{scenario}: says itself who has power and communication; leave out --powered and --connected")
+    return {"powered": 8 if powered is None else powered, "connected": 8 if connected is None else connected}

@@ -117,9 +117,7 @@ def train(
     for block in range(blocks.count):
         first = block * blocks.size
         real = min(blocks.size, n_agents - first)
-        members = jax.device_put(
-            _take(agents, validation_keys, first, blocks.size), NamedSharding(mesh, PartitionSpec(AGENTS_AXIS))
-        )
+        members = on_devices(mesh, agents, validation_keys, first, blocks.size)
 
         def report(steps: int, mean_length: float, block: int = block, first: int = first, real: int = real) -> None:
             done = first * algorithm.total_steps + real * steps
@@ -135,6 +133,16 @@ def _take(agents: Agent, keys: Key[Array, "A D"], first: int, size: int) -> tupl
     places = np.minimum(np.arange(first, first + size), keys.shape[0] - 1)
     taken: tuple[Agent, Key[Array, "B D"]] = jax.tree.map(lambda leaf: leaf[places], (agents, keys))
     return taken
+
+
+def on_devices(
+    mesh: Mesh, agents: Agent, keys: Key[Array, "A D"], first: int, size: int
+) -> tuple[Agent, Key[Array, "B D"]]:
+    """``size`` agents from ``first`` on and their draws, split over the devices of a mesh."""
+    placed: tuple[Agent, Key[Array, "B D"]] = jax.device_put(
+        _take(agents, keys, first, size), NamedSharding(mesh, PartitionSpec(AGENTS_AXIS))
+    )
+    return placed
 
 
 @dataclass(frozen=True)

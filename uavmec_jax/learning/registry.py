@@ -38,16 +38,19 @@ class Declaration:
         names = (field.name for field in dataclasses.fields(self.spec))
         return tuple(name for name in names if name not in OF_THE_SCENARIO)
 
+    def spec_of(self, settings: Mapping[str, Any], **sizes: int) -> Any:
+        """The static settings among ``settings``, with those of :data:`OF_THE_SCENARIO` that the algorithm has."""
+        fields = {field.name for field in dataclasses.fields(self.spec)}
+        chosen = {name: settings[name] for name in self.static}
+        return self.spec(**chosen, **{name: size for name, size in sizes.items() if name in fields})
+
     def make(self, settings: Mapping[str, Any], *, total_steps: int, n_devices: int, max_age: int) -> Algorithm:
         """Bind the static settings among ``settings`` to a scenario's sizes.
 
         Raises:
             ValueError: they do not fit together.
         """
-        sizes = {"total_steps": total_steps, "n_devices": n_devices, "max_age": max_age}
-        fields = {field.name for field in dataclasses.fields(self.spec)}
-        chosen = {name: settings[name] for name in self.static}
-        return self.bind(self.spec(**chosen, **{name: size for name, size in sizes.items() if name in fields}))
+        return self.bind(self.spec_of(settings, total_steps=total_steps, n_devices=n_devices, max_age=max_age))
 
 
 ALGORITHMS: Mapping[str, Declaration] = MappingProxyType(

@@ -7,7 +7,7 @@ import pandas as pd
 from rich.table import Table
 from rich.text import Text
 
-from uavmec_jax.reporting.table6 import half_interval
+from uavmec_jax.reporting.words import first_to_fail, half_interval, place
 from uavmec_jax.studies.compare import Side, differences, overall, pair
 
 _MEASURES = {
@@ -45,11 +45,10 @@ def _cells(cells: pd.DataFrame, axes: list[str]) -> Table:
     for name in (*axes, "seeds", "A", "B", "B - A"):
         table.add_column(name, justify="right")
     for _, cell in cells.iterrows():
-        place = [value if isinstance(value := cell[name], str) else f"{value:g}" for name in (*axes, "seeds")]
         style = "green" if cell["low"] > 0 else "red" if cell["high"] < 0 else "default"
         difference = Text(f"{cell['difference']:+.2f}", style=style)
         difference.append(half_interval(cell["low"], cell["high"]), style="dim")
-        table.add_row(*place, f"{cell['a']:.2f}", f"{cell['b']:.2f}", difference)
+        table.add_row(*place(cell, (*axes, "seeds")), f"{cell['a']:.2f}", f"{cell['b']:.2f}", difference)
     return table
 
 
@@ -70,6 +69,6 @@ def evaluation_table(rows: list[dict[str, Any]]) -> Table:
         table.add_column(name, justify="left" if name == "policy" else "right")
     for row in rows:
         mean = Text(f"{row['mean']:.2f}").append(half_interval(row["low"], row["high"]), style="dim")
-        device = f"#{row['first_device']} {row['first_share']:.0%}" if row["first_device"] else "UAV"
+        device = first_to_fail(row["first_device"]) + f" {row['first_share']:.0%}" * bool(row["first_device"])
         table.add_row(row["policy"], mean, str(row["shortest"]), str(row["longest"]), row["cause"], device)
     return table

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from uavmec_jax.reporting.table6 import ALGORITHM_NAMES, is_table6, label_rewards
+from uavmec_jax.reporting.table6 import is_table6, label_rewards
 from uavmec_jax.reporting.tables import is_grid
 from uavmec_jax.studies.paper import TABLE5
 from uavmec_jax.studies.results import Results
@@ -54,7 +54,7 @@ def new_figure(width: float, height: float) -> Figure:
 def grid_figure(results: Results) -> Figure:
     """Lifetimes over power x comms as heat maps: ours (best, last), the paper's, oldest-first."""
     cells = results.cells()
-    learner = ALGORITHM_NAMES.get(results.study.algorithm, "")
+    learner = results.study.algorithm.upper()
     panels = [(name, f"{learner}, {title}" if "weights" in title else title) for name, title in PANELS if name in cells]
     paper = [TABLE5.get((p, c), np.nan) for p, c in zip(cells.powered, cells.connected, strict=True)]
     seeds = int(cells["seeds"].min())
@@ -116,7 +116,7 @@ def table6_figure(results: Results) -> Figure:
     cells = results.cells()
     cells["reward"] = label_rewards(cells)
     cells["column"] = [
-        f"{ALGORITHM_NAMES[name]}\n{powered}/{connected}"
+        f"{name.upper()}\n{powered}/{connected}"
         for name, powered, connected in zip(cells.algorithm, cells.powered, cells.connected, strict=True)
     ]
     rows, columns = list(dict.fromkeys(cells["reward"])), cells.drop_duplicates("column")
@@ -148,8 +148,7 @@ def curves_figure(results: Results) -> Figure:
         for k, (algorithm, curves) in enumerate(results.curves.items()):
             x, y = curves[steps], curves[values]
             axis.plot(x, y.T, lw=0.6, alpha=0.35 if alone else 0.15, color=f"C{2 * k}")
-            name = ALGORITHM_NAMES[algorithm]
-            axis.plot(x, np.nanmean(y, axis=0), lw=2, color=f"C{2 * k + 1}", label=f"{name}, mean")
+            axis.plot(x, np.nanmean(y, axis=0), lw=2, color=f"C{2 * k + 1}", label=f"{algorithm.upper()}, mean")
         axis.set_xlabel("environment steps of one agent")
         axis.set_title(f"{title}: every agent, and their mean", fontsize=10)
         axis.grid(alpha=0.3)

@@ -7,10 +7,10 @@ import pandas as pd
 from rich.table import Table
 from rich.text import Text
 
+from uavmec_jax.reporting.words import half_interval
 from uavmec_jax.studies.paper import TABLE6
 from uavmec_jax.studies.results import Results
-
-ALGORITHM_NAMES = {"dqn": "DQN", "ppo": "PPO", "a2c": "A2C"}
+from uavmec_jax.studies.schema import PLANNERS
 
 
 def is_table6(results: Results) -> bool:
@@ -48,7 +48,7 @@ def table6_table(cells: pd.DataFrame) -> Table:
     table = Table()
     table.add_column("reward")
     for algorithm in algorithms:
-        table.add_column(ALGORITHM_NAMES[algorithm], justify="right", no_wrap=True)
+        table.add_column(algorithm.upper(), justify="right", no_wrap=True)
     keyed: Any = cells.set_index(["algorithm", "reward_shown"], drop=False)
     highest = {algorithm: keyed.loc[algorithm]["best"].max() for algorithm in algorithms}
     for shown in dict.fromkeys(cells["reward_shown"]):
@@ -70,11 +70,6 @@ def _entry(cell: Any, highest: float) -> Text:
     return text.append(half_interval(cell["last_low"], cell["last_high"]), style="dim not bold")
 
 
-def half_interval(low: float, high: float) -> str:
-    """Half an interval as ±; ±? where there is none."""
-    return f" ±{(high - low) / 2:.1f}" if high == high else " ±?"
-
-
 def _others(cells: pd.DataFrame) -> Table:
     """Heuristics, planners and bound: the same for every reward and algorithm."""
     names = list(_untrained(cells))
@@ -87,7 +82,7 @@ def _others(cells: pd.DataFrame) -> Table:
 
 
 def _untrained(cells: pd.DataFrame) -> Iterator[str]:
-    for name in cells:
+    for name in map(str, cells):
         heuristic = f"{name}_fixed" in cells and name not in ("best", "last")
-        if heuristic or name in ("rollout_planned", "beam_planned", "bound_planned"):
-            yield str(name)
+        if heuristic or name.removesuffix("_planned") in PLANNERS:
+            yield name

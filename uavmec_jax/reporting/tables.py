@@ -6,7 +6,8 @@ import pandas as pd
 from rich.table import Table
 from rich.text import Text
 
-from uavmec_jax.reporting.table6 import half_interval, is_table6, table6_tables
+from uavmec_jax.reporting.table6 import is_table6, table6_tables
+from uavmec_jax.reporting.words import first_to_fail, half_interval, place
 from uavmec_jax.studies.paper import TABLE5
 from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.study import cell_axes
@@ -110,15 +111,10 @@ def failure_table(cells: pd.DataFrame, policy: str = "best") -> Table:
 
     def first(cell: Any) -> Text:
         device = cell[f"{policy}_first_device"]
-        text = Text(_first(cell, policy), style="bold" if device else "dim")
+        text = Text(first_to_fail(device), style="bold" if device else "dim")
         return text.append(f" {cell[f'{policy}_first_share']:.0%}" * bool(device), style="not bold dim")
 
     return _grid(cells, first)
-
-
-def _first(cell: Any, policy: str) -> str:
-    device = int(cell[f"{policy}_first_device"])
-    return f"#{device}" if device else "UAV"
 
 
 def _grid(cells: pd.DataFrame, content: Any) -> Table:
@@ -152,9 +148,10 @@ def list_table(results: Results, cells: pd.DataFrame) -> Table:
                 half_interval(cell[f"{policy}_low"], cell[f"{policy}_high"]) if policy in ("best", "last") else ""
             )
             lifetimes.append(f"{cell[policy]:.1f}{interval}")
-        place = [value if isinstance(value := cell[name], str) else f"{value:g}" for name in (*axes, "seeds")]
         gaps = [f"{gap:+.1f}" for gap in gap_percent(results, cell).values()]
-        table.add_row(*place, *lifetimes, *gaps, _first(cell, results.shown))
+        table.add_row(
+            *place(cell, (*axes, "seeds")), *lifetimes, *gaps, first_to_fail(cell[f"{results.shown}_first_device"])
+        )
     return table
 
 

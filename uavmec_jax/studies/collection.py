@@ -21,6 +21,7 @@ from uavmec_jax.errors import PolicyError, StudyError
 from uavmec_jax.learning.algorithm import Algorithm
 from uavmec_jax.learning.registry import ALGORITHMS
 from uavmec_jax.studies.files import load_arrays, write_arrays
+from uavmec_jax.world.settings import tuples
 
 SCHEMA = 1
 """Version of the file."""
@@ -65,8 +66,7 @@ class Collection:
 
     def algorithm(self, name: str) -> Algorithm:
         """The algorithm of some of the agents, as far as policies need it."""
-        settings = {key: _tupled(value) for key, value in self.settings[name].items()}
-        return ALGORITHMS[name].make(settings, total_steps=1, n_devices=self.n_devices, max_age=1)
+        return ALGORITHMS[name].make(tuples(self.settings[name]), total_steps=1, n_devices=self.n_devices, max_age=1)
 
     def hyper(self, name: str, agent: Mapping[str, Any]) -> Any:
         """The hyperparameters of one agent."""
@@ -158,15 +158,10 @@ def _check_shapes(path: Path, collection: Collection) -> None:
 
 
 def _shapes(collection: Collection, name: str) -> Iterable[tuple[str, tuple[int, ...]]]:
-    settings, spec = collection.settings[name], ALGORITHMS[name].spec
-    sizes = {"n_devices": collection.n_devices}
-    network = spec(**{static: _tupled(settings[static]) for static in ALGORITHMS[name].static}, **sizes).network
+    spec = ALGORITHMS[name].spec_of(tuples(collection.settings[name]), n_devices=collection.n_devices)
+    network = spec.network
     made: Any = jax.eval_shape(network.init, jax.random.key(0), jnp.zeros((1, 2 * collection.n_devices)))
     return [(key, leaf.shape) for key, leaf in traverse_util.flatten_dict(made, sep="/").items()]
-
-
-def _tupled(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value
 
 
 def of_one(collection: Collection, name: str, place: int, which: str) -> Collection:

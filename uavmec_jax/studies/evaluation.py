@@ -204,8 +204,8 @@ class Distinct:
 
     def to_agents(self, judgement: Any) -> Any:
         """A judgement of ``S`` scenarios as one of ``A`` agents."""
-        fields = {name: getattr(judgement, name) for name in judgement.__dataclass_fields__}
-        return replace(judgement, **{name: leaf[self.scenario] for name, leaf in fields.items() if leaf is not None})
+        leaves = {name: leaf for name, leaf in vars(judgement).items() if leaf is not None}
+        return replace(judgement, **{name: leaf[self.scenario] for name, leaf in leaves.items()})
 
 
 def judge_all(

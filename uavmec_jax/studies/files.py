@@ -11,6 +11,10 @@ import numpy as np
 
 from uavmec_jax.errors import StudyError
 
+_DAMAGE = (OSError, ValueError, EOFError, AttributeError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+"""What zipfile, zlib and NumPy raise on files that are damaged or something else (an unknown compression is
+``NotImplementedError``, a bare array where an archive should be ``AttributeError``)."""
+
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file whole or not at all."""
@@ -32,15 +36,7 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
-    except (
-        OSError,
-        ValueError,
-        EOFError,
-        AttributeError,
-        NotImplementedError,
-        zipfile.BadZipFile,
-        zlib.error,
-    ) as error:
+    except _DAMAGE as error:
         raise StudyError(f"{path}: cannot be read: {error}") from None
 
 

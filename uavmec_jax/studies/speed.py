@@ -8,11 +8,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import Mesh, PartitionSpec
 
 from uavmec_jax.learning.algorithm import AGENTS_AXIS
 from uavmec_jax.learning.blocks import plan_blocks
-from uavmec_jax.learning.population import Programs
+from uavmec_jax.learning.population import Programs, on_devices
 from uavmec_jax.studies import host
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.studies.study import make_agents, make_algorithm, n_agents, validation_keys
@@ -90,18 +90,12 @@ def training_speed(
     blocks = plan_blocks(n, algorithm.agent_bytes, host.free_memory())
     mesh = Mesh(np.array(jax.local_devices()[: blocks.devices]), (AGENTS_AXIS,))
     everyone = (make_agents(study), validation_keys(study))
-
-    def members(block: int) -> Any:
-        places = np.arange(block * blocks.size, (block + 1) * blocks.size) % n
-        sharding = NamedSharding(mesh, PartitionSpec(AGENTS_AXIS))
-        return jax.device_put(jax.tree.map(lambda leaf: leaf[places], everyone), sharding)
-
     tick = time.perf_counter()
-    programs = Programs.compile(algorithm, mesh, members(0))
+    programs = Programs.compile(algorithm, mesh, on_devices(mesh, *everyone, 0, blocks.size))
     compile_seconds = time.perf_counter() - tick
     chunk, rates = max(1, 1000 // algorithm.steps_per_iteration), []
     for block in range(blocks.count):
-        agents, _ = members(block)
+        agents, _ = on_devices(mesh, *everyone, block * blocks.size, blocks.size)
         state = prepare(programs.update(agents, programs.init(agents), np.int32(0), np.int32(warm_up)))
         first = warm_up if start is None else start
 
