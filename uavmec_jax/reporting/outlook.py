@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from uavmec_jax.files import write_text
 from uavmec_jax.planning.outlook import Outlook
 from uavmec_jax.reporting import figures
 from uavmec_jax.reporting.geojson import plan_geojson
 from uavmec_jax.reporting.route_figure import route_figure
 from uavmec_jax.reporting.tables import spoken
 from uavmec_jax.studies import host
-from uavmec_jax.studies.files import write_text
 from uavmec_jax.world.inventory import Inventory
 from uavmec_jax.world.inventory_files import inventory_text
 from uavmec_jax.world.physics import Cause

@@ -4,11 +4,8 @@ A run leaves one collection of all its agents, ``weights.npz``; a policy saved o
 """
 
 import dataclasses
-import hashlib
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from flax import traverse_util
 
-from uavmec_jax.errors import PolicyError, StudyError
+from uavmec_jax.errors import PolicyError
+from uavmec_jax.files import read_checked, write_checked
 from uavmec_jax.learning.algorithm import Algorithm
 from uavmec_jax.learning.registry import ALGORITHMS
-from uavmec_jax.studies.files import load_arrays, write_arrays
 from uavmec_jax.world.settings import tuples
 
 SCHEMA = 1
@@ -28,8 +25,6 @@ SCHEMA = 1
 
 WEIGHTS = "weights.npz"
 """Name of a run's collection in its folder."""
-
-_HEADER = "header"
 
 
 @dataclass(frozen=True)
@@ -97,13 +92,8 @@ class Collection:
 
 def write_collection(path: Path, collection: Collection) -> None:
     """Write a collection, whole or not at all."""
-    facts = {
-        "schema": SCHEMA,
-        "package": f"uavmec-jax {metadata.version('uavmec-jax')}",
-        **{field: getattr(collection, field) for field in ("settings", "n_devices", "agents")},
-    }
-    facts["sha256"] = _digest(facts, collection.weights)
-    write_arrays(path, {_HEADER: np.array(json.dumps(facts)), **collection.weights})
+    facts = {field: getattr(collection, field) for field in ("settings", "n_devices", "agents")}
+    write_checked(path, SCHEMA, facts, collection.weights)
 
 
 def read_collection(path: Path) -> Collection:
@@ -112,31 +102,10 @@ def read_collection(path: Path) -> Collection:
     Raises:
         PolicyError: the file is not there, is damaged, was altered, is something else or from a newer version.
     """
-    try:
-        arrays = load_arrays(path)
-    except StudyError as error:
-        raise PolicyError(str(error)) from None
-    try:
-        facts = json.loads(str(arrays.pop(_HEADER)))
-        schema, digest = facts["schema"], facts.pop("sha256")
-    except (KeyError, ValueError, TypeError):
-        raise PolicyError(f"{path}: is not a file of policies, or one from before they had a header") from None
-    if schema != SCHEMA:
-        raise PolicyError(f"{path}: schema is {schema!r}; this version reads {SCHEMA}")
-    if digest != _digest(facts, arrays):
-        raise PolicyError(f"{path}: was altered: its contents do not fit their SHA-256")
-    found = Collection(facts["settings"], facts["n_devices"], facts["agents"], arrays)
+    facts, weights = read_checked(path, SCHEMA, "a file of policies", PolicyError)
+    found = Collection(facts["settings"], facts["n_devices"], facts["agents"], weights)
     _check_shapes(path, found)
     return found
-
-
-def _digest(facts: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
-    digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
-    for name in sorted(arrays):
-        leaf = np.ascontiguousarray(arrays[name])
-        digest.update(f"{name} {leaf.dtype.str} {leaf.shape}".encode())
-        digest.update(leaf.tobytes())
-    return digest.hexdigest()
 
 
 def _check_shapes(path: Path, collection: Collection) -> None:

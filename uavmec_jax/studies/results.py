@@ -11,9 +11,9 @@ import pandas as pd
 from flax import traverse_util
 
 from uavmec_jax.errors import StudyError
+from uavmec_jax.files import load_arrays, write_arrays, write_text
 from uavmec_jax.studies.collection import WEIGHTS, Collection, read_collection, write_collection
 from uavmec_jax.studies.evaluation import device_number
-from uavmec_jax.studies.files import load_arrays, write_arrays, write_text
 from uavmec_jax.studies.schema import PLANNERS, Study
 from uavmec_jax.studies.statistics import mean_interval
 from uavmec_jax.studies.study import cell_axes, load_study, study_toml

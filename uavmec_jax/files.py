@@ -1,0 +1,104 @@
+"""Files that are written whole or not at all, and arrays that are read without pickle."""
+
+import hashlib
+import json
+import os
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from uavmec_jax.errors import StudyError, UserError
+
+_DAMAGE = (OSError, ValueError, EOFError, AttributeError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+"""What zipfile, zlib and NumPy raise on files that are damaged or something else (an unknown compression is
+``NotImplementedError``, a bare array where an archive should be ``AttributeError``)."""
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file whole or not at all."""
+    _write(path, lambda file: file.write(text.encode()))
+
+
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write named arrays as a compressed ``.npz``, whole or not at all."""
+    named: dict[str, Any] = dict(arrays)
+    _write(path, lambda file: np.savez_compressed(file, **named))
+
+
+def load_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Read named arrays; each member's CRC is checked.
+
+    Raises:
+        StudyError: the file is not there, is no such file, or is damaged.
+    """
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+    except _DAMAGE as error:
+        raise StudyError(f"{path}: cannot be read: {error}") from None
+
+
+_HEADER = "header"
+
+
+def write_checked(path: Path, schema: int, facts: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+    """Write named arrays under a header of facts (what JSON can hold), schema and SHA-256, whole or not at all."""
+    header = {"schema": schema, "package": f"uavmec-jax {metadata.version('uavmec-jax')}", **facts}
+    header["sha256"] = _digest(header, arrays)
+    write_arrays(path, {_HEADER: np.array(json.dumps(header)), **arrays})
+
+
+def read_checked(
+    path: Path, schema: int, what: str, error: type[UserError]
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The facts and the arrays that :func:`write_checked` wrote.
+
+    Args:
+        path: the file.
+        schema: the version that is read.
+        what: the file should be, for messages.
+        error: what is raised.
+
+    Raises:
+        UserError: the file is not there, is damaged, was altered, is something else or of another version.
+    """
+    try:
+        arrays = load_arrays(path)
+    except StudyError as damage:
+        raise error(str(damage)) from None
+    try:
+        facts = json.loads(str(arrays.pop(_HEADER)))
+        found, digest = facts["schema"], facts.pop("sha256")
+    except (KeyError, ValueError, TypeError):
+        raise error(f"{path}: is not {what}, or one from before they had a header") from None
+    if found != schema:
+        raise error(f"{path}: schema is {found!r}; this version reads {schema}")
+    if digest != _digest(facts, arrays):
+        raise error(f"{path}: was altered: its contents do not fit their SHA-256")
+    return facts, arrays
+
+
+def _digest(facts: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
+    digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
+    for name in sorted(arrays):
+        leaf = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {leaf.dtype.str} {leaf.shape}".encode())
+        digest.update(leaf.tobytes())
+    return digest.hexdigest()
+
+
+def _write(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:
+    partial = path.with_name(f".{path.name}.part")
+    try:
+        with partial.open("wb") as file:
+            fill(file)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
