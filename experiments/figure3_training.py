@@ -17,7 +17,7 @@ host.use_every_core()
 import numpy as np  # noqa: E402
 import pandas as pd  # noqa: E402
 
-from uavmec_jax.reporting import figures  # noqa: E402
+from uavmec_jax.reporting import canvas  # noqa: E402
 from uavmec_jax.studies.results import Results  # noqa: E402
 from uavmec_jax.studies.run import run_study  # noqa: E402
 from uavmec_jax.studies.study import parse_study  # noqa: E402
@@ -52,7 +52,7 @@ def main() -> None:
     short = run(arguments.out, "short", [0], steps * 2 // 5, [0.0071])
     seeds = run(arguments.out, "seeds", [0, 1, 2], steps, [0.0071])
 
-    figure = figures.new_figure(9, 7)
+    figure = canvas.new_figure(9, 7)
     top, bottom = figure.subplots(2, 1)
     draw(top, long, 0, f"learning rate 0.01, {steps:,} steps")
     draw(top, long, 1, f"learning rate 0.0071, {steps:,} steps")
@@ -66,7 +66,7 @@ def main() -> None:
         axis.set(title=title, xlabel="environment steps", ylabel="episode length, slots")
         axis.grid(alpha=0.3)
         axis.legend()
-    figures.save(figure, arguments.out / "figure3.png")
+    canvas.save(figure, arguments.out / "figure3.png")
     for results in (long, short, seeds):
         print(
             results.agents[

@@ -14,7 +14,7 @@ host.use_every_core()
 
 from rich.console import Console  # noqa: E402
 
-from uavmec_jax.reporting import figures, tables  # noqa: E402
+from uavmec_jax.reporting import canvas, figures, tables  # noqa: E402
 from uavmec_jax.studies.run import run_study  # noqa: E402
 from uavmec_jax.studies.study import load_study  # noqa: E402
 
@@ -30,7 +30,7 @@ def run(study: str, seeds: int, about: str) -> None:
 
     overrides = {"axes.seeds": arguments.seeds, "steps": arguments.steps}
     results = run_study(load_study(arguments.study, overrides), out)
-    figures.save(figures.run_figure(results), out / "figure.png")
+    canvas.save(figures.run_figure(results), out / "figure.png")
     console = Console()
     for title, table in tables.tables(results).items():
         console.print(title)

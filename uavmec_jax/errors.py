@@ -15,3 +15,7 @@ class LayoutError(UserError):
 
 class PolicyError(UserError):
     """A saved policy, or what it is asked, is not usable."""
+
+
+class TrafficError(UserError):
+    """A road network, a place, a device file or an evacuation is not usable, or SUMO is not there or failed."""

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from uavmec_jax.reporting import figures
+from uavmec_jax.reporting import canvas, figures
 from uavmec_jax.reporting.table6 import is_table6, label_rewards
 from uavmec_jax.reporting.tables import tables
 from uavmec_jax.studies.results import Results
@@ -57,7 +57,7 @@ def test_rewards_under_a_second_guard_say_so(results):
 
 
 def test_figure(results, tmp_path):
-    figures.save(figures.run_figure(results), tmp_path / "figure.png")
+    canvas.save(figures.run_figure(results), tmp_path / "figure.png")
     assert (tmp_path / "figure.png").stat().st_size > 20_000
 
 

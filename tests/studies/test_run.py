@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from uavmec_jax.errors import PolicyError, StudyError
-from uavmec_jax.reporting import figures, tables
+from uavmec_jax.reporting import canvas, figures, tables
 from uavmec_jax.studies import host
 from uavmec_jax.studies.results import load_results, load_weights
 from uavmec_jax.studies.run import _BYTES_WITHOUT_TRAINING, check_directory, plan_study, run_study
@@ -107,7 +107,7 @@ def test_tables_and_figures(finished, tmp_path):
     assert "Mean over 4 cells" in lines[0]
     assert "On the planners' draws (2 per layout): best weights" in lines[1]
     for figure in (figures.run_figure(results), figures.curves_figure(results), figures.ladder_figure(results)):
-        figures.save(figure, tmp_path / "figure.png")
+        canvas.save(figure, tmp_path / "figure.png")
         assert (tmp_path / "figure.png").stat().st_size > 10_000
 
 

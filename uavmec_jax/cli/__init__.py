@@ -8,6 +8,7 @@ from uavmec_jax.cli.common import fail
 from uavmec_jax.cli.machine import doctor
 from uavmec_jax.cli.scenarios import evaluate, plan
 from uavmec_jax.cli.studies import compare, run, show, validate
+from uavmec_jax.cli.traffic import traffic
 from uavmec_jax.errors import UserError
 
 
@@ -34,10 +35,11 @@ def main() -> None:
     uavmec run my-study.toml      a study of your own
     uavmec plan my-town.toml      tours for your own devices, what fails first, what to repair
     uavmec show runs/...          the tables of a run again
+    uavmec traffic show albany    an evacuation, and which devices see it
     uavmec evaluate runs/...      one of its policies on one scenario
     uavmec compare runs/a runs/b  two runs, seed by seed
     """
 
 
-for _command in (run, plan, evaluate, show, compare, validate, doctor):
+for _command in (run, plan, evaluate, show, compare, validate, traffic, doctor):
     main.add_command(_command)

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -12,6 +13,7 @@ from uavmec_jax.cli.common import assignment, command_line, fail, new_folder, pr
 @click.argument("scenario", required=False, type=click.Path(path_type=Path))
 @click.option("--powered", type=int, help="Devices with grid power, of a random town (default: 8).")
 @click.option("--connected", type=int, help="Devices with communication, of a random town (default: 8).")
+@click.option("--place", help="Where the random town's devices stand: a simulated evacuation (see uavmec traffic).")
 @click.option("--seed", type=int, default=0, help="Of the random town and of the task volumes.")
 @click.option("--draws", type=int, default=8, help="Volume draws that lifetimes are judged on (default: 8).")
 @click.option("--width", type=int, default=256, help="States the beam keeps (default: 256).")
@@ -22,6 +24,7 @@ def plan(
     scenario: Path | None,
     powered: int | None,
     connected: int | None,
+    place: str | None,
     seed: int,
     draws: int,
     width: int,
@@ -30,7 +33,7 @@ def plan(
     as_json: bool,
 ) -> None:
     """Plan for SCENARIO, a layout file (TOML or CSV), or for a random town: tours, bound, first failure, repairs."""
-    town = _town(scenario, powered, connected)
+    town = _town(scenario, powered, connected, place)
     if not 1 <= width <= 100_000:
         fail(f"--width is {width}; give 1 to 100000 states")
     from uavmec_jax.studies import host
@@ -44,7 +47,12 @@ def plan(
     from uavmec_jax.studies.scenario import load_scenario
 
     inventory, keys = load_scenario(
-        scenario, **town, seed=seed, draws=draws, settings=dict(assignment(setting) for setting in settings)
+        scenario,
+        place=place,
+        **town,
+        seed=seed,
+        draws=draws,
+        settings=dict(assignment(setting) for setting in settings),
     )
     directory = out or new_folder("plan")
     check_directory(directory)
@@ -63,6 +71,7 @@ def plan(
 @click.argument("policy")
 @click.option("--powered", type=int, help="Devices with grid power, of a random town (default: 8).")
 @click.option("--connected", type=int, help="Devices with communication, of a random town (default: 8).")
+@click.option("--place", help="Where the random town's devices stand: a simulated evacuation (see uavmec traffic).")
 @click.option("--seed", type=int, default=0, help="Of the random town and of the task volumes.")
 @click.option("--scenario", type=click.Path(path_type=Path), help="A layout file instead of a random town.")
 @click.option("--draws", type=int, default=32, help="Volume draws that it is judged on (default: 32).")
@@ -77,6 +86,7 @@ def evaluate(
     policy: str,
     powered: int | None,
     connected: int | None,
+    place: str | None,
     seed: int,
     scenario: Path | None,
     draws: int,
@@ -90,7 +100,7 @@ def evaluate(
 
     Of a run it is by default the agent that learned in the town asked for.
     """
-    town = _town(scenario, powered, connected)
+    town = _town(scenario, powered, connected, place)
     from rich.console import Console
 
     from uavmec_jax.reporting.compare import evaluation_table
@@ -103,7 +113,12 @@ def evaluate(
         axes = town | {"seed": seed} | axes
     chosen = load_policy(policy, weights, **axes)
     inventory, keys = load_scenario(
-        scenario, **town, seed=seed, draws=draws, settings=dict(assignment(setting) for setting in settings)
+        scenario,
+        place=place,
+        **town,
+        seed=seed,
+        draws=draws,
+        settings=dict(assignment(setting) for setting in settings),
     )
     rows = judge(chosen, Path(policy).name, inventory, keys)
     trained = chosen if isinstance(chosen, TrainedPolicy) else None
@@ -135,8 +150,8 @@ def evaluate(
             )
 
 
-def _town(scenario: Path | None, powered: int | None, connected: int | None) -> dict[str, int]:
-    """How many devices of a random town have what; refuses counts beside a layout file."""
-    if scenario is not None and (powered, connected) != (None, None):
-        fail(f"{scenario}: says itself who has power and communication; leave out --powered and --connected")
+def _town(scenario: Path | None, powered: int | None, connected: int | None, place: str | None) -> dict[str, Any]:
+    """How many devices of a random town have what; refuses counts and places beside a layout file."""
+    if scenario is not None and (powered, connected, place) != (None, None, None):
+        fail(f"{scenario}: says itself what its devices have; leave out --powered, --connected and --place")
     return {"powered": 8 if powered is None else powered, "connected": 8 if connected is None else connected}

@@ -37,7 +37,7 @@ def run(
     out: Path | None,
     as_json: bool,
 ) -> None:
-    """Train and judge STUDY: a study that ships with the package (table5, table5-tuned, table6, planning) or a TOML file."""
+    """Train and judge STUDY: a study that ships with the package (table5, table6, table7, planning, ...) or a TOML file."""
     overrides: dict[str, Any] = {}
     if quick:
         overrides |= {
@@ -54,7 +54,7 @@ def run(
     host.use_every_core()
     from rich.console import Console
 
-    from uavmec_jax.reporting import figures
+    from uavmec_jax.reporting import canvas, figures
     from uavmec_jax.reporting.progress import progress_bar
     from uavmec_jax.studies.run import check_directory, plan_study, run_study
     from uavmec_jax.studies.study import load_study
@@ -68,7 +68,7 @@ def run(
     with progress_bar(console, plan) as on_progress:
         results = run_study(resolved, directory, command=command_line(), on_progress=on_progress)
     if len(results.agents):
-        figures.save(figures.run_figure(results), directory / "figure.png")
+        canvas.save(figures.run_figure(results), directory / "figure.png")
         print_results(results, directory, console, as_json)
     if not results.run["complete"]:
         done = len(results.agents)
@@ -128,9 +128,11 @@ def compare(
 @click.option("--json", "as_json", is_flag=True, help="Print the resolved study as JSON.")
 def validate(file: str, as_json: bool) -> None:
     """Check the study FILE (or a shipped study) without running it."""
+    from uavmec_jax.studies.places import load_evacuations
     from uavmec_jax.studies.study import load_study, n_agents
 
     study = load_study(file)
+    load_evacuations(study)
     if as_json:
         click.echo(study.model_dump_json(indent=1))
     else:

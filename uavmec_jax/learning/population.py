@@ -20,7 +20,7 @@ from jaxtyping import Array, Key
 
 from uavmec_jax.learning.algorithm import AGENTS_AXIS, Agent, Algorithm
 from uavmec_jax.learning.blocks import Blocks
-from uavmec_jax.world.rollout import rollouts
+from uavmec_jax.world.rollout import returns, rollouts
 
 
 @dataclass(frozen=True)
@@ -59,12 +59,13 @@ class TrainedBlock:
         last: weights after the last step, leaves ``[B, ...]``.
         best: weights of the best look, leaves ``[B, ...]``.
         best_step: ``[B]`` environment step of the best look.
-        best_score: ``[B]`` mean validation lifetime of the best look, slots.
+        best_score: ``[B]`` validation score of the best look: mean lifetime in slots, or, of agents that are paid for
+            traffic, mean return.
         diverged_at: ``[B]`` step at which an agent was frozen, -1 if it was not.
         chunk_steps: ``[C]`` environment steps of one agent at the end of each chunk.
         episode_length: ``[B, C]`` mean length of the training episodes that ended in each chunk (NaN if none did).
         look_steps: ``[L]`` environment steps of one agent at each look.
-        validation: ``[B, L]`` mean validation lifetime at each look.
+        validation: ``[B, L]`` validation score at each look.
         seconds: wall time by activity: ``compile``, ``train``, ``validate``.
     """
 
@@ -195,10 +196,16 @@ def _compiler_options() -> dict[str, bool]:
 
 
 def _look(algorithm: Algorithm, agent: Agent, keys: Key[Array, " D"], weights: Any, best: Best, step: Any) -> Any:
-    """Mean validation lifetime of the greedy policy of one agent, and the best so far (ties keep the earlier)."""
+    """Validation score of the greedy policy of one agent, and the best so far (ties keep the earlier).
+
+    The score is the mean lifetime; of agents that are paid for more, for traffic, it is what they earn.
+    """
     scenario = agent.scenario
     policy = algorithm.policy(agent.hyper, weights)
     score = jnp.mean(rollouts(policy, scenario.params, scenario.layout, keys).length.astype(jnp.float32))
+    if scenario.layout.traffic is not None:
+        paid = (scenario.reward.traffic_bonus > 0) | (scenario.reward.traffic_penalty > 0)
+        score = jnp.where(paid, jnp.mean(returns(policy, scenario, keys)), score)
     better = score > best.score
     kept = jax.tree.map(
         lambda new, old: jnp.where(better, new, old), (weights, score, step), (best.weights, best.score, best.step)
@@ -221,7 +228,7 @@ def _train_block(
     shard = state.diverged_at.sharding
     best = Best(
         weights=jax.tree.map(jnp.copy, state.weights),
-        score=jax.device_put(jnp.full((size,), -1.0), shard),
+        score=jax.device_put(jnp.full((size,), -jnp.inf), shard),
         step=jax.device_put(jnp.zeros((size,), jnp.int32), shard),
     )
     seconds = {"train": 0.0, "validate": 0.0}

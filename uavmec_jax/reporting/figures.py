@@ -1,16 +1,16 @@
 """Figures, from result files only."""
 
-from pathlib import Path
-
 import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from uavmec_jax.reporting.canvas import new_figure
 from uavmec_jax.reporting.table6 import is_table6, label_rewards
+from uavmec_jax.reporting.table7_figure import table7_figure
 from uavmec_jax.reporting.tables import is_grid
+from uavmec_jax.studies.first_failures import has_places
 from uavmec_jax.studies.paper import TABLE5
 from uavmec_jax.studies.results import Results
 
@@ -26,29 +26,16 @@ LADDER = {
 
 
 def run_figure(results: Results) -> Figure:
-    """The figure of a run: the grids of a power x comms study, else its training curves; lifetimes if nothing trained."""
+    """The figure of a run: maps and first failures of places; grids of power x comms; lifetimes, if nothing was trained;
+    else training curves.
+    """
+    if has_places(results):
+        return table7_figure(results)
     if not results.curves:
         return ladder_figure(results)
     if is_table6(results):
         return table6_figure(results)
     return grid_figure(results) if is_grid(results) else curves_figure(results)
-
-
-def save(figure: Figure, path: Path) -> None:
-    """Write a figure, whole or not at all; the ending says the format."""
-    partial = path.with_name(f".{path.stem}.part{path.suffix}")
-    try:
-        figure.savefig(partial, dpi=144, metadata={"Software": None} if path.suffix == ".png" else None)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
-
-
-def new_figure(width: float, height: float) -> Figure:
-    """An empty figure that needs no display."""
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
 
 
 def grid_figure(results: Results) -> Figure:

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from uavmec_jax.files import write_text
 from uavmec_jax.planning.outlook import Outlook
-from uavmec_jax.reporting import figures
+from uavmec_jax.reporting import canvas
 from uavmec_jax.reporting.geojson import plan_geojson
 from uavmec_jax.reporting.route_figure import route_figure
 from uavmec_jax.reporting.tables import spoken
@@ -181,7 +181,7 @@ def save_outlook(outlook: Outlook, inventory: Inventory, directory: Path, comman
     }
     if inventory.origin is not None:
         texts["plan.geojson"] = _json(plan_geojson(inventory, outlook))
-    figures.save(route_figure(outlook, names, scenario), directory / "plan.png")
+    canvas.save(route_figure(outlook, names, scenario), directory / "plan.png")
     for name, text in texts.items():
         write_text(directory / name, text)
 

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from uavmec_jax.planning.outlook import Outlook
-from uavmec_jax.reporting.figures import new_figure
+from uavmec_jax.reporting.canvas import new_figure
 from uavmec_jax.reporting.map_figure import draw_devices
 
 _TITLES = {"rollout": "rollout planner", "beam": "beam (clairvoyant)"}

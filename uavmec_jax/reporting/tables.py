@@ -7,7 +7,9 @@ from rich.table import Table
 from rich.text import Text
 
 from uavmec_jax.reporting.table6 import is_table6, table6_tables
+from uavmec_jax.reporting.table7 import table7_tables
 from uavmec_jax.reporting.words import first_to_fail, half_interval, place
+from uavmec_jax.studies.first_failures import has_places
 from uavmec_jax.studies.paper import TABLE5
 from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.study import cell_axes
@@ -22,8 +24,11 @@ def is_grid(results: Results) -> bool:
 
 
 def tables(results: Results) -> dict[str, Table]:
-    """The tables of a run by title: Table 5 or 6 where the study is such a grid, else a list of cells."""
+    """The tables of a run by title: Tables 5 to 7 where the study is like theirs, else a list of cells."""
     cells = results.cells()
+    if has_places(results):
+        lifetimes = {"Lifetime in slots, mean over the seeds ± 95 %": list_table(results, cells)}
+        return lifetimes | table7_tables(results)
     if is_table6(results):
         return table6_tables(cells)
     if not is_grid(results):

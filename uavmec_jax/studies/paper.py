@@ -48,3 +48,11 @@ TABLE6: Mapping[tuple[str, int, int, str], float] = MappingProxyType(
     }
 )
 """Table 6: (reward, powered, connected, algorithm) -> maximum episode length in slots."""
+
+TABLE7: Mapping[str, tuple[int, ...]] = MappingProxyType(
+    {
+        "round_lake": (2, 0, 0, 0, 0, 3, 0, 0, 6, 0, 8, 11),
+        "albany": (0, 0, 0, 3, 0, 1, 6, 10, 5, 3, 2, 0),
+    }
+)
+"""Table 7: place -> of 30 tests, how often each of the devices 1 to 12 failed first."""

@@ -18,6 +18,7 @@ from uavmec_jax.learning.blocks import Blocks, PopulationTooLargeError, plan_blo
 from uavmec_jax.learning.population import Progress, TrainedBlock, Validation
 from uavmec_jax.studies import host
 from uavmec_jax.studies.evaluation import Distinct, Judgement, judge_all, judge_learned
+from uavmec_jax.studies.places import describe_places, load_evacuations
 from uavmec_jax.studies.results import SCHEMA, Results, holds_run
 from uavmec_jax.studies.schema import TRACED_PARAMS, Study
 from uavmec_jax.studies.study import (
@@ -68,7 +69,9 @@ def plan_study(study: Study) -> Plan:
 
     Raises:
         StudyError: the population does not fit in memory.
+        TrafficError: a place of the study is not usable.
     """
+    load_evacuations(study)
     agents, free = n_agents(study), host.free_memory()
     needed = agents * _BYTES_WITHOUT_TRAINING
     if needed > free:
@@ -242,7 +245,7 @@ class _Population:
         results.add(self.study.algorithm, rows.assign(**columns), curves, evaluation, weights)
 
 
-_WHAT_IS_PLAYED = ("seed", "powered", "connected", *TRACED_PARAMS)
+_WHAT_IS_PLAYED = ("seed", "powered", "connected", "place", *TRACED_PARAMS)
 """Columns that say what an agent plays; all others say how it learns."""
 
 
@@ -255,6 +258,7 @@ def _label(study: Study, plan: Plan, command: str | None) -> dict[str, Any]:
         "complete": False,
         "agents": plan.agents,
         "seeds": seeds_of(study),
+        **({"places": places} if (places := describe_places(study)) else {}),
         "blocks": {name: asdict(blocks) for name, blocks in plan.blocks.items()},
         **host.describe(),
     }

@@ -1,5 +1,6 @@
 """One scenario to plan for or to judge a policy on: a layout file, or the town that a seed stands for in every study."""
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,10 @@ from jaxtyping import Array, Key
 from uavmec_jax.errors import StudyError
 from uavmec_jax.planning.heuristics import HEURISTICS
 from uavmec_jax.studies.evaluation import commonest, device_number, judgement
+from uavmec_jax.studies.places import on_place
 from uavmec_jax.studies.statistics import mean_interval
 from uavmec_jax.studies.study import held_out_draws, town
+from uavmec_jax.traffic.evacuation import load_evacuation
 from uavmec_jax.world.inventory import Inventory, inventory_of
 from uavmec_jax.world.inventory_files import load_inventory
 from uavmec_jax.world.params import Params
@@ -25,6 +28,7 @@ MOST_DRAWS = 10_000
 def load_scenario(
     source: Path | None,
     *,
+    place: str | Path | None = None,
     powered: int = 8,
     connected: int = 8,
     seed: int = 0,
@@ -36,6 +40,7 @@ def load_scenario(
     Args:
         source: a layout file; ``None`` for the town of ``seed`` with so many powered and connected devices, and the
             draws that studies hold out for it.
+        place: a simulated evacuation whose devices' positions that town has.
         powered: devices with grid power.
         connected: devices with communication.
         seed: of the town, and of the draws.
@@ -44,6 +49,7 @@ def load_scenario(
 
     Raises:
         LayoutError: the layout file is not usable.
+        TrafficError: the place is not usable, or a hop in it would take longer than a slot may.
         StudyError: a number does not fit.
     """
     settings = tuples(settings or {})
@@ -52,6 +58,24 @@ def load_scenario(
             raise StudyError(f"--{name} is {value}; give a whole number from {int(name == 'draws')} to {most}")
     if source is not None:
         return load_inventory(source, settings), held_out_draws(seed, 0, 0, draws)
+    params = _params(settings)
+    evacuation = None if place is None else load_evacuation(place)
+    if evacuation is not None:
+        params = replace(params, n_devices=evacuation.n_devices, region_m=evacuation.region_m())
+        evacuation.check_hops(params.uav_speed_m_s, params.slot_cap_s)
+    for name, count in (("powered", powered), ("connected", connected)):
+        if not 0 <= count <= params.n_devices:
+            raise StudyError(f"--{name} is {count}; give 0 to {params.n_devices}, the number of devices")
+    layout = town(seed, params, powered, connected)
+    name = f"{powered} powered, {connected} connected, seed {seed}"
+    keys = held_out_draws(seed, powered, connected, draws)
+    if evacuation is None:
+        return inventory_of(layout, params, name), keys
+    name = f"{evacuation.name}, {name}"
+    return inventory_of(on_place(layout, evacuation), params, name, evacuation.meta["names"]), keys
+
+
+def _params(settings: dict[str, Any]) -> Params:
     try:
         checked = ParamsSettings.model_validate(settings)
         check_ranges(checked, "")
@@ -59,13 +83,7 @@ def load_scenario(
         raise StudyError(one_line("--set", error, ParamsSettings)) from None
     except ValueError as error:
         raise StudyError(f"--set: {error}") from None
-    params = Params(**checked.model_dump())
-    for name, count in (("powered", powered), ("connected", connected)):
-        if not 0 <= count <= params.n_devices:
-            raise StudyError(f"--{name} is {count}; give 0 to {params.n_devices}, the number of devices")
-    name = f"{powered} powered, {connected} connected, seed {seed}"
-    inventory = inventory_of(town(seed, params, powered, connected), params, name)
-    return inventory, held_out_draws(seed, powered, connected, draws)
+    return Params(**checked.model_dump())
 
 
 def evaluate(policy: Policy, name: str, inventory: Inventory, keys: Key[Array, " D"]) -> list[dict[str, Any]]:

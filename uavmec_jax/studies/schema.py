@@ -5,6 +5,7 @@ study file are made from those declarations.
 """
 
 import dataclasses
+import math
 from typing import Annotated, Any, Literal, get_args
 
 import pydantic
@@ -32,6 +33,11 @@ AlgorithmName = Literal["dqn", "ppo", "a2c"]
 TRACED_PARAMS = tuple(field.name for field in dataclasses.fields(Params) if isinstance(field.default, int | float))
 TRACED_PARAMS = tuple(name for name in TRACED_PARAMS if name != "n_devices")
 """Scenario parameters that may be axes of a study."""
+
+TRAFFIC_WEIGHTS = ("traffic_bonus", "traffic_penalty")
+"""Settings that say what traffic weighs in the reward."""
+
+_OTHER_AXES = ("powered", "connected", "cells", "seeds", "algorithm", "reward", "guard", "place", *TRAFFIC_WEIGHTS)
 
 Heuristic = Literal[
     "stay-put",
@@ -78,9 +84,19 @@ class Study(Strict):
     guard: Literal["clamp", "log1p"] = "clamp"
     steps: Annotated[int, Field(ge=1, le=2_000_000_000)] = 1_000_000
     """Environment steps of one agent."""
+    place: str = ""
+    """A place whose evacuation was simulated: one that ships with the package, or a file. Empty: random towns."""
+    place_scale_m: Annotated[float, Field(gt=0)] | None = None
+    """Longer side that a place is scaled to (the paper's region: 800); by default distances are the real ones."""
+    traffic: Literal["static", "moving"] = "static"
+    """Devices' traffic weights: their mean over the evacuation, or as it moves on."""
+    traffic_bonus: Annotated[float, Field(ge=0)] = 0.0
+    """Added to the reward when a device is visited, times its traffic weight."""
+    traffic_penalty: Annotated[float, Field(ge=0)] = 0.0
+    """Taken off the reward when a device is the first to fail, times its traffic weight."""
     axes: dict[str, Any]
     """``powered`` and ``connected``, or ``cells`` (pairs of the two); ``seeds`` (a number or a list); ``algorithm``,
-    ``reward``, ``guard``, any traced setting."""
+    ``reward``, ``guard``, ``place``, ``traffic_bonus``, ``traffic_penalty``, any traced setting."""
     dqn: DQNSettings = DQNSettings()
     ppo: PPOSettings = PPOSettings()
     a2c: A2CSettings = A2CSettings()
@@ -99,6 +115,7 @@ class Study(Strict):
     def _check(self) -> "Study":
         _check_reward("reward", self.reward)
         _check_axes(self)
+        _check_traffic(self)
         check_ranges(self.params, "params.")
         _check_algorithms(self)
         if self.algorithm == "none" and not self.evaluation.baselines + self.evaluation.planners:
@@ -114,6 +131,15 @@ def _check_reward(where: str, reward: Any) -> None:
         for term in reward:
             if term not in TERMS:
                 raise ValueError(f"{where} has the term {term!r}, which is not one; {nearest(term, TERMS)}")
+
+
+def _check_traffic(study: Study) -> None:
+    """Traffic stands where there is a place to have it."""
+    if study.place or "place" in study.axes:
+        return
+    for name in (*TRAFFIC_WEIGHTS, "place_scale_m"):
+        if getattr(study, name) or name in study.axes:
+            raise ValueError(f"{name} is given, but no place; give place, e.g. place = 'albany'")
 
 
 def _check_algorithms(study: Study) -> None:
@@ -137,7 +163,7 @@ def traced(study: Study) -> tuple[str, ...]:
 
 
 def _check_known(study: Study, name: str) -> None:
-    known = ("powered", "connected", "cells", "seeds", "algorithm", "reward", "guard", *traced(study), *TRACED_PARAMS)
+    known = (*_OTHER_AXES, *traced(study), *TRACED_PARAMS)
     if name in known:
         return
     for algorithm in study.algorithms:
@@ -196,6 +222,12 @@ def _check_value(study: Study, name: str, where: str, value: Any) -> None:
     elif name == "guard":
         if value not in LOG_GUARDS:
             raise ValueError(f"{where} has {value!r}; {nearest(str(value), LOG_GUARDS)}")
+    elif name == "place":
+        if not isinstance(value, str) or not value:
+            raise ValueError(f"{where} has {value!r}; give names of places or paths of their files")
+    elif name in TRAFFIC_WEIGHTS:
+        if not isinstance(value, int | float) or isinstance(value, bool) or not 0 <= value < math.inf:
+            raise ValueError(f"{where} has {value!r}; give finite numbers from 0")
     else:
         own = [type(getattr(study, algorithm)) for algorithm in study.algorithms or ("dqn",)]
         for settings in own if name in traced(study) else [ParamsSettings]:

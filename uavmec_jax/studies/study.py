@@ -4,6 +4,7 @@ import itertools
 import math
 import tomllib
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,8 @@ import tomli_w
 from uavmec_jax.errors import StudyError
 from uavmec_jax.learning.algorithm import Agent, Algorithm
 from uavmec_jax.learning.registry import ALGORITHMS
-from uavmec_jax.studies.schema import Study
+from uavmec_jax.studies.places import onto_places
+from uavmec_jax.studies.schema import TRAFFIC_WEIGHTS, Study
 from uavmec_jax.world.environment import Scenario
 from uavmec_jax.world.layout import Layout, sample_layout
 from uavmec_jax.world.params import Params
@@ -95,7 +97,8 @@ def _listed(data: dict[str, Any]) -> dict[str, Any]:
 def study_toml(study: Study) -> str:
     """The study, every setting resolved, as TOML that :func:`load_study` reads back to an equal study."""
     silent = set(ALGORITHMS) - set(study.algorithms)
-    return tomli_w.dumps(study.model_dump(mode="json", exclude=silent) | {"params": _finite(study.params.model_dump())})
+    plain = study.model_dump(mode="json", exclude=silent, exclude_none=True)
+    return tomli_w.dumps(plain | {"params": _finite(study.params.model_dump())})
 
 
 def _finite(params: dict[str, Any]) -> dict[str, Any]:
@@ -204,9 +207,8 @@ def make_agents(study: Study, reward: Reward | None = None) -> Agent:
 
     settings: dict[str, Any] = {name: spread(name, value) for name, value in study.params.model_dump().items()}
     params = Params(**settings)
-    layout = jax.jit(jax.vmap(town))(seeds, params, powered, connected)
-    named = [(agent.get("reward", study.reward), agent.get("guard", study.guard)) for agent in who]
-    rewards = [make_reward(*pair) for pair in named] if reward is None else [reward] * len(who)
+    layout = onto_places(jax.jit(jax.vmap(town))(seeds, params, powered, connected), who, study)
+    rewards = [_reward_of(study, agent, reward) for agent in who]
     declared = ALGORITHMS["dqn" if study.algorithm == "none" else study.algorithm]
     own = getattr(study, "dqn" if study.algorithm == "none" else study.algorithm)
     return Agent(
@@ -216,6 +218,14 @@ def make_agents(study: Study, reward: Reward | None = None) -> Agent:
         ),
         hyper=declared.hyper(**{name: leaf(name, getattr(own, name)) for name in declared.traced}),
     )
+
+
+def _reward_of(study: Study, agent: Mapping[str, Any], reward: Reward | None) -> Reward:
+    """The reward of one agent: the given one or the study's, with what traffic weighs in it."""
+    if reward is None:
+        reward = make_reward(agent.get("reward", study.reward), agent.get("guard", study.guard))
+    traffic = {name: jnp.float32(agent.get(name, getattr(study, name))) for name in TRAFFIC_WEIGHTS}
+    return replace(reward, **traffic)
 
 
 def town(seed: Any, params: Params, n_powered: Any, n_connected: Any) -> Layout:

@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 from uavmec_jax.world.layout import Layout, sample_layout
 from uavmec_jax.world.params import Params
 from uavmec_jax.world.physics import Cause, Outcome, State, initial_state, transition
-from uavmec_jax.world.rewards import Reward, make_reward, reward_of
+from uavmec_jax.world.rewards import Reward, make_reward, reward_of, traffic_reward
 
 
 @struct.dataclass
@@ -48,7 +48,10 @@ def advance(
 ) -> tuple[State, Float[Array, ""], Outcome]:
     """One slot with explicit volumes and no reset: next state, reward, outcome."""
     after, outcome = transition(scenario.params, scenario.layout, state, action, volumes)
-    return after, reward_of(scenario.reward, scenario.layout, state, action, after), outcome
+    reward = reward_of(scenario.reward, scenario.layout, state, action, after)
+    if scenario.layout.traffic is not None:  # other towns keep the bits and the speed that they have
+        reward += traffic_reward(scenario.reward, scenario.layout, state, action, outcome)
+    return after, reward, outcome
 
 
 def is_truncated(scenario: Scenario, state: State, outcome: Outcome) -> Array:

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -229,14 +230,14 @@ def _hardware(number: int, device: Device) -> tuple[float, float, float]:
     return standby, active, rate
 
 
-def inventory_of(layout: Layout, params: Params, name: str) -> Inventory:
-    """An inventory of a layout that was drawn at random; devices are called ``device 1``, ``device 2``, ..."""
+def inventory_of(layout: Layout, params: Params, name: str, names: Sequence[str] | None = None) -> Inventory:
+    """An inventory of a layout that was drawn at random; unless named, devices are ``device 1``, ``device 2``, ..."""
     own = jax.tree.map(np.asarray, layout)
     settings = {field: getattr(params, field) for field in ParamsSettings.model_fields if field != "n_devices"}
     changed = {field: value for field, value in settings.items() if value != getattr(Params(), field)}
     devices = tuple(
         {
-            "name": f"device {i + 1}",
+            "name": names[i] if names else f"device {i + 1}",
             "x_m": float(own.position[i, 0]),
             "y_m": float(own.position[i, 1]),
             "type": tables.DEVICE_TYPES[own.device_type[i]],

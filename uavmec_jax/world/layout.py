@@ -1,5 +1,6 @@
 """Layouts: what one random draw, or one user's inventory, fixes about the devices."""
 
+import math
 from typing import Any
 
 import jax
@@ -9,6 +10,26 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from uavmec_jax.world import tables
 from uavmec_jax.world.params import Params
+
+
+@struct.dataclass
+class Traffic:
+    """How much traffic each device sees while its town is evacuated.
+
+    Attributes:
+        weight: ``[W, n]`` in [0, 1], one row for each window of the evacuation; one row alone stands for all of it.
+        window_s: s, length of a window; the first one begins with the first slot, the last one lasts.
+    """
+
+    weight: Any
+    window_s: Any = math.inf
+
+    def at(self, seconds: Any) -> Any:
+        """Weights ``[n]`` at a time in seconds since the first slot began."""
+        windows = self.weight.shape[0]
+        if windows == 1:
+            return self.weight[0]
+        return self.weight[jnp.minimum(seconds / self.window_s, windows - 1).astype(jnp.int32)]
 
 
 @struct.dataclass
@@ -25,6 +46,7 @@ class Layout:
         standby_power: ``[n]`` W, from the type.
         active_power: ``[n]`` W, from type and task.
         processing_rate: ``[n]`` bytes/s, from type and task.
+        traffic: what traffic they see, or ``None``: nobody knows.
     """
 
     position: Any
@@ -36,6 +58,7 @@ class Layout:
     standby_power: Any
     active_power: Any
     processing_rate: Any
+    traffic: Traffic | None = None
 
 
 def make_layout(

@@ -37,6 +37,7 @@ class State:
         uav_position: ``[2]`` m.
         uav_energy: J left in the UAV.
         slot: int32, slots completed.
+        elapsed: s, length of the slots completed.
     """
 
     battery: Any
@@ -44,6 +45,7 @@ class State:
     uav_position: Any
     uav_energy: Any
     slot: Any
+    elapsed: Any = 0.0
 
 
 @struct.dataclass
@@ -74,6 +76,7 @@ def initial_state(params: Params, layout: Layout) -> State:
         uav_position=jnp.zeros((2,), jnp.float32),
         uav_energy=jnp.asarray(params.uav_battery_j, jnp.float32),
         slot=jnp.zeros((), jnp.int32),
+        elapsed=jnp.zeros((), jnp.float32),
     )
 
 
@@ -142,6 +145,7 @@ def transition(
         uav_position=hover_point,
         uav_energy=state.uav_energy - uav_cost,
         slot=state.slot + 1,
+        elapsed=state.elapsed + duration,
     )
     unstarted = replace(state, slot=state.slot + jnp.where(params.count_unfinished_slot, 1, 0))
     after = jax.tree.map(lambda played, kept: jnp.where(starts, played, kept), after, unstarted)

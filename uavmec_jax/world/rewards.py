@@ -11,7 +11,7 @@ from flax import struct
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from uavmec_jax.world.layout import Layout
-from uavmec_jax.world.physics import State
+from uavmec_jax.world.physics import Outcome, State
 
 TERMS: tuple[str, ...] = ("A", "U", "M", "O", "log A", "log U", "log M", "log O")
 """The terms a reward weighs, in the order of a weight vector.
@@ -72,15 +72,24 @@ class Reward:
         weights: ``[8]`` over :data:`TERMS`.
         log1p: bool; the guard of the logarithms, see :data:`LOG_GUARDS`.
         function: ``None``, or what makes a scalar from ``{term: scalar}`` in place of the weights; static.
+        traffic_bonus: added once for a device in the densest traffic when it is visited, less for others, in proportion
+            to their traffic (paper, section 4.5).
+        traffic_penalty: taken off, in the same proportion, for the device that fails first.
     """
 
     weights: Any
     log1p: Any = False
     function: Callable[[Mapping[str, Any]], Any] | None = struct.field(pytree_node=False, default=None)
+    traffic_bonus: Any = 0.0
+    traffic_penalty: Any = 0.0
 
 
 def make_reward(
-    reward: str | Mapping[str, float] | Callable[[Mapping[str, Any]], Any] = DEFAULT_REWARD, guard: str = "clamp"
+    reward: str | Mapping[str, float] | Callable[[Mapping[str, Any]], Any] = DEFAULT_REWARD,
+    guard: str = "clamp",
+    *,
+    traffic_bonus: float = 0.0,
+    traffic_penalty: float = 0.0,
 ) -> Reward:
     """Return a :class:`Reward` from a name of Table 6, from weights of one's own, or from a function.
 
@@ -88,23 +97,29 @@ def make_reward(
         reward: ``"U+log(A/O)"``; or ``{"U": 1.0, "log A": 1.0}``; or a function of a mapping from :data:`TERMS` to
             scalars that returns a scalar and can be traced, e.g. ``lambda terms: terms["U"] * terms["M"]``.
         guard: one of :data:`LOG_GUARDS`.
+        traffic_bonus: see :class:`Reward`; has an effect where the layout knows its traffic.
+        traffic_penalty: likewise.
 
     Raises:
         ValueError: unknown name, term or guard; or the function does not return a scalar.
     """
     if guard not in LOG_GUARDS:
         raise ValueError(f"unknown log guard {guard!r}; guards are {', '.join(LOG_GUARDS)}")
-    log1p = jnp.asarray(guard == "log1p")
+    common = {
+        "log1p": jnp.asarray(guard == "log1p"),
+        "traffic_bonus": jnp.float32(traffic_bonus),
+        "traffic_penalty": jnp.float32(traffic_penalty),
+    }
     if callable(reward):
         _check_function(reward)
-        return Reward(weights=jnp.zeros(len(TERMS)), log1p=log1p, function=reward)
+        return Reward(weights=jnp.zeros(len(TERMS)), function=reward, **common)
     if isinstance(reward, str):
         if reward not in REWARDS:
             raise ValueError(f"unknown reward {reward!r}; rewards are {', '.join(REWARDS)}")
         weights = REWARDS[reward]
     else:
         weights = make_weights(reward)
-    return Reward(weights=jnp.asarray(weights), log1p=log1p)
+    return Reward(weights=jnp.asarray(weights), **common)
 
 
 def _check_function(function: Callable[[Mapping[str, Any]], Any]) -> None:
@@ -145,3 +160,17 @@ def reward_of(
     if reward.function is not None:
         return jnp.asarray(reward.function(dict(zip(TERMS, terms, strict=True))), jnp.float32)
     return jnp.dot(reward.weights, terms)
+
+
+def traffic_reward(
+    reward: Reward, layout: Layout, before: State, action: Int[ArrayLike, ""], outcome: Outcome
+) -> Float[Array, ""]:
+    """What traffic adds to the reward of one slot; 0 where nobody knows the traffic.
+
+    ``traffic_bonus * w[action] - traffic_penalty * sum(first_failure * w)`` with the weights ``w`` when the slot begins.
+    """
+    if layout.traffic is None:
+        return jnp.zeros(())
+    weight = layout.traffic.at(before.elapsed)
+    lost = jnp.dot(outcome.first_failure, weight)
+    return jnp.asarray(reward.traffic_bonus * weight[action] - reward.traffic_penalty * lost, jnp.float32)

@@ -6,9 +6,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Int, Key, PRNGKeyArray
+from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
-from uavmec_jax.world.environment import draw_volumes
+from uavmec_jax.world.environment import Scenario, advance, draw_volumes
 from uavmec_jax.world.layout import Layout
 from uavmec_jax.world.params import Params
 from uavmec_jax.world.physics import Cause, Outcome, State, initial_state, transition
@@ -100,14 +100,24 @@ def _slot_player(
     policy: Policy, params: Params, layout: Layout, key: PRNGKeyArray
 ) -> Callable[[State], tuple[Array, State, Outcome]]:
     """What plays one slot of the episode of ``key``: the policy's action, the state after it, the outcome."""
-    n = layout.capacity.shape[0]
-    policy_key = jax.random.fold_in(key, _POLICY_STREAM)
+    act, volumes = _decisions(policy, params, layout, key)
 
     def play_slot(state: State) -> tuple[Array, State, Outcome]:
-        action = policy(params, layout, state, jax.random.fold_in(policy_key, state.slot))
-        return action, *transition(params, layout, state, action, slot_volumes(params, n, key, state.slot))
+        action = act(state)
+        return action, *transition(params, layout, state, action, volumes(state))
 
     return play_slot
+
+
+def _decisions(
+    policy: Policy, params: Params, layout: Layout, key: PRNGKeyArray
+) -> tuple[Callable[[State], Array], Callable[[State], Array]]:
+    """The policy's action and the task volumes in a state of the episode of ``key``."""
+    policy_key = jax.random.fold_in(key, _POLICY_STREAM)
+    return (
+        lambda state: policy(params, layout, state, jax.random.fold_in(policy_key, state.slot)),
+        lambda state: slot_volumes(params, layout.capacity.shape[0], key, state.slot),
+    )
 
 
 def _nothing(n: int) -> Outcome:
@@ -124,6 +134,26 @@ def _nothing(n: int) -> Outcome:
 def rollouts(policy: Policy, params: Params, layout: Layout, keys: Key[Array, " D"]) -> Episode:
     """Play one episode per volume draw; ``keys`` is ``[D]`` and every field of the result gains a leading ``D``."""
     return jax.vmap(lambda key: rollout(policy, params, layout, key))(keys)
+
+
+def returns(policy: Policy, scenario: Scenario, keys: Key[Array, " D"]) -> Float[Array, " D"]:
+    """Undiscounted sum of the rewards of the episodes that :func:`rollouts` plays."""
+
+    def one(key: PRNGKeyArray) -> Array:
+        act, volumes = _decisions(policy, scenario.params, scenario.layout, key)
+
+        def next_slot(carry: tuple[State, Outcome, Array]) -> tuple[State, Outcome, Array]:
+            after, reward, outcome = advance(scenario, carry[0], act(carry[0]), volumes(carry[0]))
+            return after, outcome, carry[2] + reward
+
+        def going_on(carry: tuple[State, Outcome, Array]) -> Array:
+            return _goes_on(scenario.params, *carry[:2])
+
+        nothing = _nothing(scenario.layout.capacity.shape[0])
+        start = (initial_state(scenario.params, scenario.layout), nothing, jnp.zeros(()))
+        return jax.lax.while_loop(going_on, next_slot, start)[2]
+
+    return jax.vmap(one)(keys)
 
 
 @struct.dataclass

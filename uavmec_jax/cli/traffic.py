@@ -1,0 +1,195 @@
+"""Commands about evacuation traffic."""
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import click
+
+from uavmec_jax.cli.common import assignment, command_line, fail
+
+
+@click.group()
+def traffic() -> None:
+    """Evacuations: which devices see the traffic.
+
+    \b
+    uavmec traffic show albany                    a place that ships with the package
+    uavmec traffic build --osm town.osm.gz        any town, from an OpenStreetMap extract (needs SUMO)
+    uavmec traffic show town.npz --figure map.png
+    """
+
+
+@traffic.command()
+@click.argument("place", required=False)
+@click.option("--osm", type=click.Path(path_type=Path), help="An OpenStreetMap extract: .osm, .osm.gz, .osm.bz2.")
+@click.option("--bbox", metavar="W,S,E,N", help="Part of the extract, in degrees.")
+@click.option("--net", type=click.Path(path_type=Path), help="A SUMO network, .net.xml.")
+@click.option("--devices", type=click.Path(path_type=Path), help="TOML file with a [[device]] table for each device.")
+@click.option(
+    "--origin", "origins", multiple=True, metavar="ROAD", help="Where people live (default: residential roads)."
+)
+@click.option(
+    "--exit", "exits", multiple=True, metavar="NAME[=WEIGHT]", help="Where they leave (default: highway ends)."
+)
+@click.option("--vehicles", type=int, help="Vehicles that are evacuated.")
+@click.option("--seeds", type=int, help="Simulations that are averaged.")
+@click.option(
+    "--set", "settings", multiple=True, metavar="NAME=VALUE", help="Any setting, e.g. demand.warm_up_s=300.0."
+)
+@click.option("--out", type=click.Path(path_type=Path), help="File to write (default: <place>.npz).")
+@click.option("--json", "as_json", is_flag=True, help="Print the devices as JSON on standard output.")
+def build(
+    place: str | None,
+    osm: Path | None,
+    bbox: str | None,
+    net: Path | None,
+    devices: Path | None,
+    origins: tuple[str, ...],
+    exits: tuple[str, ...],
+    vehicles: int | None,
+    seeds: int | None,
+    settings: tuple[str, ...],
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Simulate the evacuation of PLACE (a TOML file, or one that ships with the package) or of a map or network."""
+    if sum(source is not None for source in (place, osm, net)) != 1:
+        fail("give one of PLACE, --osm FILE and --net FILE")
+    if bbox is not None and osm is None:
+        fail(f"--bbox {bbox}: cuts an OpenStreetMap extract; give --osm too")
+    from rich.console import Console
+
+    from uavmec_jax.traffic.build import build_evacuation
+    from uavmec_jax.traffic.place import load_place, make_place, read_toml
+
+    changes: dict[str, Any] = {"demand": {}, "simulation": {}}
+    if origins:
+        changes["demand"]["origins"] = origins
+    if exits:
+        changes["demand"]["exits"] = dict(_exit(one) for one in exits)
+    if vehicles is not None:
+        changes["demand"]["vehicles"] = vehicles
+    if seeds is not None:
+        changes["simulation"]["seeds"] = seeds
+    for dotted, value in map(assignment, settings):
+        table, _, name = dotted.partition(".")
+        if not name:
+            fail(f"--set {dotted}: name a table and a setting, e.g. demand.vehicles=2000")
+        changes.setdefault(table, {})[name] = value
+    if devices is not None:
+        changes["device"] = read_toml(devices).get("device", [])
+        if not changes["device"]:
+            fail(f"{devices}: holds no [[device]] tables")
+    if place is not None:
+        resolved, folder = load_place(place, changes)
+    else:
+        source = osm or net
+        assert source is not None
+        found: dict[str, Any] = {"osm" if osm else "net": str(source.absolute())}
+        if bbox is not None:
+            found["bbox"] = _box(bbox)
+        name = source.name.split(".")[0] or "town"
+        resolved, folder = make_place({"name": name, "network": found} | changes, str(source)), Path()
+    target = _target(out or Path(f"{resolved.name}.npz"))
+    console = Console(stderr=True)
+    with console.status("starting") as status:
+        evacuation = build_evacuation(resolved, folder, command=command_line(), on_progress=status.update)
+    evacuation.save(target)
+    _print(evacuation, str(target), as_json)
+
+
+@traffic.command()
+@click.argument("source")
+@click.option("--figure", type=click.Path(path_type=Path), help="Draw the road map (.png, .svg or .pdf).")
+@click.option("--animation", type=click.Path(path_type=Path), help="Draw one evacuation slot by slot (.gif).")
+@click.option("--policy", default="earliest-deadline", help="Who flies in the animation: a rule, or a policy file.")
+@click.option("--powered", type=int, default=8, help="Devices with grid power in the animation (default: 8).")
+@click.option("--connected", type=int, default=6, help="Devices with communication in the animation (default: 6).")
+@click.option("--seed", type=int, default=0, help="Of hardware, power, communication and task volumes.")
+@click.option("--json", "as_json", is_flag=True, help="Print the devices as JSON on standard output.")
+def show(
+    source: str,
+    figure: Path | None,
+    animation: Path | None,
+    policy: str,
+    powered: int,
+    connected: int,
+    seed: int,
+    as_json: bool,
+) -> None:
+    """Show SOURCE, an evacuation's file or a place that ships with the package: its devices and their traffic."""
+    from uavmec_jax.traffic.evacuation import load_evacuation
+
+    evacuation = load_evacuation(source)
+    for path, endings in ((figure, (".png", ".svg", ".pdf")), (animation, (".gif",))):
+        if path is not None and path.suffix.lower() not in endings:
+            fail(f"{path}: ends in {path.suffix!r}; it should end in {' or '.join(endings)}")
+    written = []
+    if figure is not None:
+        from uavmec_jax.reporting.canvas import save
+        from uavmec_jax.reporting.road_map import map_figure
+
+        save(map_figure(evacuation), figure)
+        written.append(figure)
+    if animation is not None:
+        from uavmec_jax.reporting.animation import save_animation
+        from uavmec_jax.studies.policies import load_policy
+        from uavmec_jax.studies.scenario import load_scenario
+
+        chosen = load_policy(policy)
+        inventory, keys = load_scenario(None, place=source, powered=powered, connected=connected, seed=seed)
+        title = f"{evacuation.name}, {Path(policy).name}"
+        save_animation(animation, evacuation, inventory.params, inventory.layout, chosen, keys[0], title)
+        written.append(animation)
+    _print(evacuation, source, as_json)
+    for path in written:
+        click.echo(f"File: {path}", err=as_json)
+
+
+def _print(evacuation: Any, source: str, as_json: bool) -> None:
+    """The devices as a table, or as JSON."""
+    from rich.console import Console
+
+    from uavmec_jax.reporting.evacuation import evacuation_data, evacuation_lines, evacuation_table
+
+    if as_json:
+        click.echo(json.dumps(evacuation_data(evacuation), indent=1))
+        return
+    console = Console()
+    console.print(f"[bold]{evacuation.name}[/bold]: {evacuation.meta['description']}", highlight=False)
+    console.print(evacuation_table(evacuation))
+    for line in evacuation_lines(evacuation):
+        console.print(line, highlight=False)
+    console.print(f"File: {source}", highlight=False, soft_wrap=True)
+
+
+def _exit(text: str) -> tuple[str, Any]:
+    """``NAME`` or ``NAME=WEIGHT``."""
+    name, equals, weight = text.rpartition("=")
+    if not equals:
+        return text, 1.0
+    try:
+        return name, float(weight)
+    except ValueError:
+        fail(f"--exit {text}: the weight is {weight!r}; give NAME=WEIGHT with a number above 0")
+
+
+def _box(text: str) -> tuple[float, ...]:
+    try:
+        sides = tuple(float(side) for side in text.split(","))
+    except ValueError:
+        sides = ()
+    if len(sides) != 4:
+        fail(f"--bbox {text}: give west,south,east,north in degrees, e.g. 9.68,50.85,9.74,50.885")
+    return sides
+
+
+def _target(path: Path) -> Path:
+    """A file that can be written, known before anything is simulated."""
+    if path.suffix != ".npz":
+        fail(f"--out {path}: ends in {path.suffix!r}; it should end in .npz")
+    if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+        fail(f"--out {path}: {path.parent} is not a folder that can be written to")
+    return path

@@ -1,0 +1,66 @@
+"""What devices see of an evacuation, as a table, as lines and as data."""
+
+from typing import Any
+
+from rich.table import Table
+
+from uavmec_jax.traffic.evacuation import Evacuation
+
+
+def evacuation_table(evacuation: Evacuation) -> Table:
+    """One line per device; those in high traffic are bold."""
+    table = Table()
+    for name in ("#", "device"):
+        table.add_column(name, justify="right" if name == "#" else "left")
+    for name in ("m east", "m north", "vehicles/km/lane", "± seeds", "weight"):
+        table.add_column(name, justify="right")
+    position = evacuation.local_position()
+    for k, name in enumerate(evacuation.meta["names"]):
+        numbers = (f"{position[k, 0]:.0f}", f"{position[k, 1]:.0f}", f"{evacuation.density[k]:.1f}")
+        table.add_row(
+            str(k + 1),
+            name,
+            *numbers,
+            f"{evacuation.density_spread[k]:.1f}",
+            f"{evacuation.weight[k]:.2f}",
+            style="bold" if evacuation.busy[k] else None,
+        )
+    return table
+
+
+def evacuation_lines(evacuation: Evacuation) -> list[str]:
+    """How it was simulated, and what to know about that."""
+    meta = evacuation.meta
+    first, last = (seconds / 60 for seconds in meta["mean_s"])
+    loaded, unfinished, teleports = (sum(meta[name]) for name in ("loaded", "unfinished", "teleports"))
+    width, height = evacuation.region_m()
+    lines = [
+        f"Means over {first:.0f} to {last:.0f} min after the order to leave and over {meta['seeds']} simulations; roads "
+        f"within {meta['radius_m']:g} m. Bold: at least half the weight of the busiest.",
+        f"{loaded:,} vehicles in all ({meta['vehicles']:,} evacuated in each), {unfinished:,} had not left at the end, "
+        f"{teleports:,} were stuck and moved on. The devices span {width:,.0f} x {height:,.0f} m. SUMO {meta['sumo']}.",
+    ]
+    if meta["cut_off"]:
+        lines.append(f"{meta['cut_off']} residential roads have no way to any exit; nobody leaves from there.")
+    return lines + [f"Warning: {line}." for line in meta["warnings"]]
+
+
+def evacuation_data(evacuation: Evacuation) -> dict[str, Any]:
+    """The same for programs."""
+    position = evacuation.local_position()
+    meta = {name: value for name, value in evacuation.meta.items() if name not in ("roads", "names")}
+    devices = [
+        {
+            "number": k + 1,
+            "name": name,
+            "x_m": round(float(position[k, 0]), 1),
+            "y_m": round(float(position[k, 1]), 1),
+            "density": round(float(evacuation.density[k]), 3),
+            "density_spread": round(float(evacuation.density_spread[k]), 3),
+            "weight": round(float(evacuation.weight[k]), 4),
+            "window_weight": [round(float(weight), 4) for weight in evacuation.window_weight[:, k]],
+            "high_traffic": bool(evacuation.busy[k]),
+        }
+        for k, name in enumerate(evacuation.meta["names"])
+    ]
+    return {"meta": meta, "devices": devices}

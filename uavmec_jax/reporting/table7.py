@@ -1,0 +1,106 @@
+"""Who fails first in an evacuation: the paper's Table 7 and studies like it."""
+
+from typing import Any
+
+import pandas as pd
+from rich.table import Table
+from rich.text import Text
+
+from uavmec_jax.reporting.words import half_interval
+from uavmec_jax.studies.first_failures import LEARNED, first_failure_counts, traffic_claims
+from uavmec_jax.studies.paper import TABLE7
+from uavmec_jax.studies.results import Results
+from uavmec_jax.studies.schema import TRAFFIC_WEIGHTS
+
+_SHORT = {
+    "oldest_first": "oldest",
+    "earliest_deadline": "deadline",
+    "lowest_battery": "battery",
+    "shortest_life": "life",
+    "shortest_tour": "tour",
+}
+_SIGNIFICANT = 0.05
+
+
+def traffic_words(cell: Any) -> str:
+    """What traffic weighs in the reward of a cell: ``none``, ``visit 10`` (the paper's bonus), ``failure 100``, or both."""
+    bonus, penalty = (float(cell.get(name, 0.0)) for name in TRAFFIC_WEIGHTS)
+    words = [f"visit {bonus:g}"] * (bonus > 0) + [f"failure {penalty:g}"] * (penalty > 0)
+    return " + ".join(words) or "none"
+
+
+def table7_tables(results: Results) -> dict[str, Table]:
+    """First failures of each place's devices, lifetimes, and the test of the paper's claim."""
+    counts = first_failure_counts(results)
+    seeds = int(counts["seeds"].max())
+    shown = {
+        f"{place}: first failures of each device in {seeds} scenarios; best weights by what traffic weighs in their reward": (
+            counts_table(counts[counts["place"] == place])
+        )
+        for place in dict.fromkeys(counts["place"])
+    }
+    claims = traffic_claims(results)
+    if len(claims):
+        shown["First failures on devices in high traffic, with traffic in the reward against without, seed by seed"] = (
+            claims_table(claims)
+        )
+    return shown
+
+
+def columns_of(counts: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Column title -> its rows of one place's counts: best weights by reward, then everyone who learns nothing."""
+    named = counts.assign(traffic=[traffic_words(row) for row in counts.to_dict("records")])
+    trained = named[named["policy"] == "best"]
+    columns = {str(words): own for words, own in trained.groupby("traffic", sort=False)}
+    for policy in dict.fromkeys(named["policy"]):
+        if policy not in LEARNED:
+            own = named[named["policy"] == policy]
+            first = own[own["traffic"] == own["traffic"].iloc[0]]  # the same whatever a learner is paid for
+            columns[_SHORT.get(policy, policy.replace("_", "-"))] = first
+    return columns
+
+
+def counts_table(counts: pd.DataFrame) -> Table:
+    """One place: devices down, policies across, the paper last; those in high traffic are bold."""
+    columns = columns_of(counts)
+    paper = TABLE7.get(str(counts["place"].iloc[0]))
+    table = Table()
+    for name in ("#", "weight", *columns, *(["paper"] if paper else [])):
+        table.add_column(name, justify="right")
+    devices = counts.drop_duplicates("device")
+    for k, device in enumerate(devices.itertuples()):
+        cells = [f"{own['count'].iloc[k]:.1f}" for own in columns.values()]
+        row = [str(device.device), f"{device.weight:.2f}", *cells, *([str(paper[k])] if paper else [])]
+        table.add_row(*row, style="bold" if device.high_traffic else None, end_section=k + 1 == len(devices))
+    busy = devices["high_traffic"].to_numpy()
+    totals = [f"{own['count'].to_numpy()[busy].sum():.1f}" for own in columns.values()]
+    ours = sum(count for count, high in zip(paper or (), busy, strict=False) if high)
+    table.add_row("high", "", *totals, *([str(ours)] if paper else []))
+    return table
+
+
+def claims_table(claims: pd.DataFrame) -> Table:
+    """A line per place, weights and traffic: shares, paired difference, exact sign test, effect, price in slots."""
+    table = Table()
+    for name in ("place", "weights", "traffic"):
+        table.add_column(name)
+    for name in ("without", "with", "difference", "fewer/more/same", "exact p", "g", "slots"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for _, row in claims.iterrows():
+        style = "green" if row["difference"] < 0 else "red"
+        table.add_row(
+            row["place"],
+            row["policy"],
+            traffic_words(row),
+            f"{row['share_without']:.0%}",
+            f"{row['share']:.0%}",
+            Text(
+                f"{100 * row['difference']:+.0f}{half_interval(100 * row['low'], 100 * row['high'])}",
+                style=style if row["p_value"] < _SIGNIFICANT else "default",
+            ),
+            f"{row['fewer']}/{row['more']}/{row['same']}",
+            f"{row['p_value']:.2g}",
+            f"{row['g']:+.2f}",
+            f"{row['slots']:+.1f}{half_interval(row['slots_low'], row['slots_high'])}",
+        )
+    return table

@@ -1,0 +1,109 @@
+"""Who fails first in an evacuation, and whether the reward keeps it from being a device in high traffic (Table 7)."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from uavmec_jax.studies.results import Results
+from uavmec_jax.studies.schema import PLANNERS, TRAFFIC_WEIGHTS
+from uavmec_jax.studies.statistics import mean_interval, sign_test
+from uavmec_jax.studies.study import cell_axes
+
+ALL_PLACES = "all places"
+LEARNED = ("best", "last")
+
+
+def has_places(results: Results) -> bool:
+    """Whether a study's towns are places whose evacuation was simulated."""
+    return bool(results.run.get("places"))
+
+
+def first_failure_counts(results: Results) -> pd.DataFrame:
+    """How many of its scenarios each device is the first to fail in: one row per cell, policy and device.
+
+    A scenario (a seed) counts by the share of its held-out episodes in which the device was first; the counts of a row's
+    cell add up to its seeds, less the episodes that the UAV's battery ended. Columns: the axes of the cell, ``policy``,
+    ``device`` (from 1), ``name``, ``weight``, ``high_traffic``, ``count``, ``seeds``.
+    """
+    rows = []
+    for cell, group in _cells(results):
+        place = results.run["places"][cell["place"]]
+        for policy in players(results):
+            counts = _first_failures(results, policy)[group.index].sum(axis=0)
+            for k, count in enumerate(counts):
+                named = {name: place[name][k] for name in ("name", "weight", "high_traffic")}
+                rows.append(cell | {"policy": policy, "device": k + 1} | named | {"count": count, "seeds": len(group)})
+    return pd.DataFrame(rows)
+
+
+def players(results: Results) -> list[str]:
+    """Policies and planners whose first failures are known."""
+    return [*results.policies, *(name for name in PLANNERS if f"{name}/first_failure" in results.evaluation)]
+
+
+def high_traffic_share(results: Results, policy: str) -> np.ndarray:
+    """``[A]`` share of each agent's first failures that hit a device in high traffic."""
+    busy = np.array(
+        [results.run["places"][_place(results, row)]["high_traffic"] for _, row in results.agents.iterrows()]
+    )
+    return np.asarray((_first_failures(results, policy) * busy).sum(axis=1))
+
+
+def traffic_claims(results: Results) -> pd.DataFrame:
+    """The paper's claim as a test: with traffic in the reward, do fewer first failures hit devices in high traffic?
+
+    Every pair of traffic weights against the same agents without any, seed by seed; per place and policy, and over all
+    places (their mean for each seed, since a seed draws the same hardware in each). Columns: ``place``, ``policy``, the
+    axes of the cell, ``share`` and ``share_without`` of the first failures, ``difference`` with ``low`` and ``high`` (95 %),
+    ``fewer``, ``more``, ``same`` seeds, exact ``p_value``, Cohen's ``g``; ``slots`` of lifetime more, ``slots_low``,
+    ``slots_high``. Empty if the study has no agents without traffic in the reward.
+    """
+    study, rows = results.study, []
+    agents = results.agents.assign(place=[_place(results, row) for _, row in results.agents.iterrows()])
+    for name in TRAFFIC_WEIGHTS:
+        if name not in agents:
+            agents[name] = getattr(study, name)
+    others = [axis for axis in cell_axes(study) if axis not in ("place", *TRAFFIC_WEIGHTS)]
+    for policy in (name for name in LEARNED if name in results.policies):
+        table = agents.assign(share=high_traffic_share(results, policy), slots=agents[f"{policy}_lifetime"])
+        table = table[["seed", *others, "place", *TRAFFIC_WEIGHTS, "share", "slots"]]
+        everywhere = (
+            table.groupby(["seed", *others, *TRAFFIC_WEIGHTS], sort=False)[["share", "slots"]].mean().reset_index()
+        )
+        both = [table, everywhere.assign(place=ALL_PLACES)] if table["place"].nunique() > 1 else [table]
+        without = pd.concat(both)
+        paid = without[(without[list(TRAFFIC_WEIGHTS)] > 0).any(axis=1)]
+        without = without[(without[list(TRAFFIC_WEIGHTS)] == 0).all(axis=1)].drop(columns=list(TRAFFIC_WEIGHTS))
+        pairs = paid.merge(without, on=["seed", *others, "place"], suffixes=("", "_without"))
+        for values, group in pairs.groupby([*others, "place", *TRAFFIC_WEIGHTS], sort=False):
+            cell = dict(zip([*others, "place", *TRAFFIC_WEIGHTS], values, strict=True))
+            rows.append(cell | {"policy": policy} | _claim(group))
+    return pd.DataFrame(rows)
+
+
+def _claim(pairs: pd.DataFrame) -> dict[str, Any]:
+    share = (pairs["share"] - pairs["share_without"]).to_numpy()
+    slots = (pairs["slots"] - pairs["slots_without"]).to_numpy()
+    row: dict[str, Any] = {"share": pairs["share"].mean(), "share_without": pairs["share_without"].mean()}
+    row |= dict(zip(("difference", "low", "high"), mean_interval(share), strict=True)) | vars(sign_test(share))
+    return row | dict(zip(("slots", "slots_low", "slots_high"), mean_interval(slots), strict=True))
+
+
+def _cells(results: Results) -> Iterable[tuple[dict[str, Any], pd.DataFrame]]:
+    axes = cell_axes(results.study)
+    for values, group in results.agents.groupby(axes, sort=False):
+        cell = dict(zip(axes, values, strict=True))
+        yield cell | {"place": cell.get("place", results.study.place)}, group
+
+
+def _place(results: Results, agent: Any) -> str:
+    return str(agent.get("place", results.study.place))
+
+
+def _first_failures(results: Results, policy: str) -> np.ndarray:
+    """``[A, n]`` share of the episodes in which each device is the first to fail."""
+    if policy in results.policies:
+        return results.first_failures(policy)
+    return np.asarray(results.evaluation[f"{policy}/first_failure"].mean(axis=1))

@@ -1,0 +1,219 @@
+"""Places: where the road network comes from, who drives, where the devices are. Read from TOML, every number checked."""
+
+import tomllib
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any
+
+import pydantic
+from pydantic import Field
+
+from uavmec_jax.errors import TrafficError
+from uavmec_jax.world.inventory import MOST_DEVICES
+from uavmec_jax.world.settings import Strict, nearest, one_line
+
+_Positive = Annotated[float, Field(gt=0, le=1e7)]
+_NotNegative = Annotated[float, Field(ge=0, le=1e7)]
+
+PLACES = resources.files("uavmec_jax.traffic") / "places"
+
+
+def shipped_places() -> tuple[str, ...]:
+    """Names of the places that ship with the package."""
+    return tuple(sorted(folder.name for folder in PLACES.iterdir() if folder.is_dir()))
+
+
+class NetworkSource(Strict):
+    """Where the roads come from: one of the three kinds. Paths are relative to the file of the place."""
+
+    nodes: str | None = None
+    """SUMO's plain XML: nodes, edges and types."""
+    edges: str | None = None
+    types: str | None = None
+    osm: str | None = None
+    """An OpenStreetMap extract: .osm, .osm.gz or .osm.bz2."""
+    bbox: tuple[float, float, float, float] | None = None
+    """Part of the extract: west, south, east, north, in degrees."""
+    net: str | None = None
+    """A network that SUMO's netconvert has made."""
+
+    @pydantic.model_validator(mode="after")
+    def _check(self) -> "NetworkSource":
+        plain = [self.nodes, self.edges, self.types]
+        if sum([any(plain), self.osm is not None, self.net is not None]) != 1 or (any(plain) and not all(plain)):
+            raise ValueError("network is unclear; give osm, or net, or all of nodes, edges and types")
+        if self.bbox is not None:
+            west, south, east, north = self.bbox
+            if self.osm is None:
+                raise ValueError("network.bbox is given without network.osm; it cuts an OpenStreetMap extract")
+            if not (-180 <= west < east <= 180 and -90 <= south < north <= 90):
+                raise ValueError(f"network.bbox is {list(self.bbox)}; give [west, south, east, north] in degrees")
+        return self
+
+
+class Demand(Strict):
+    """Who drives, and when."""
+
+    vehicles: Annotated[int, Field(ge=1, le=1_000_000)] = 4000
+    """Vehicles that are evacuated."""
+    loading_sigma_s: _Positive = 1200.0
+    """Rayleigh loading: by ``t`` seconds after the order, ``1 - exp(-t^2 / (2 sigma^2))`` of them have left."""
+    through_per_hour: _NotNegative = 600.0
+    """Vehicles that pass through, from one highway end to another."""
+    warm_up_s: _NotNegative = 600.0
+    """Seconds of through traffic alone before the order to leave."""
+    origins: tuple[str, ...] = ()
+    """Edges where people live; by default the residential roads. Each is weighted by its length."""
+    exits: dict[str, _Positive] = Field(default_factory=dict)
+    """Junctions or edges where they leave -> weight; by default the highway ends, weighted by their lanes."""
+    rerouting: Annotated[float, Field(ge=0, le=1)] = 1.0
+    """Share of the drivers who look for a faster way while they drive."""
+
+
+class Simulation(Strict):
+    """How the evacuation is simulated and averaged."""
+
+    seeds: Annotated[int, Field(ge=1, le=1000)] = 5
+    duration_s: _Positive = 7200.0
+    """Seconds after the order to leave."""
+    window_s: _Positive = 600.0
+    """Densities are averaged over windows of this length."""
+    mean_s: tuple[_NotNegative, _Positive] = (0.0, 3600.0)
+    """Devices' weights are means over this part of the evacuation."""
+    time_limit_s: _Positive = 900.0
+    """Wall-clock seconds after which one simulation is stopped."""
+
+    @pydantic.model_validator(mode="after")
+    def _check(self) -> "Simulation":
+        if self.window_s > self.duration_s:
+            raise ValueError(
+                f"simulation.window_s is {self.window_s:g}; it should be at most duration_s ({self.duration_s:g})"
+            )
+        if self.duration_s / self.window_s > 1000:
+            raise ValueError(
+                f"simulation.window_s is {self.window_s:g}; give at most 1000 windows in {self.duration_s:g} s"
+            )
+        first, last = self.windows
+        if not 0 <= first < last:
+            raise ValueError(
+                f"simulation.mean_s is {list(self.mean_s)}; give [from, to] with whole windows within the evacuation"
+            )
+        return self
+
+    @property
+    def n_windows(self) -> int:
+        """Windows of the evacuation."""
+        return int(self.duration_s // self.window_s)
+
+    @property
+    def windows(self) -> tuple[int, int]:
+        """First and one past the last window of the mean."""
+        return round(self.mean_s[0] / self.window_s), min(round(self.mean_s[1] / self.window_s), self.n_windows)
+
+
+class Site(Strict):
+    """One device of a file: at a junction, or at a point of the network in metres."""
+
+    name: Annotated[str, Field(min_length=1, max_length=80)]
+    junction: str | None = None
+    x_m: float | None = None
+    y_m: float | None = None
+
+    @pydantic.model_validator(mode="after")
+    def _check(self) -> "Site":
+        if (self.junction is None) != (self.x_m is not None and self.y_m is not None):
+            raise ValueError(f"device {self.name!r}: place is unclear; give junction, or x_m and y_m")
+        return self
+
+
+class Placement(Strict):
+    """Where devices go that no file places: junctions far from each other, some of them on the corridors."""
+
+    count: Annotated[int, Field(ge=2, le=MOST_DEVICES)] = 12
+    corridor_share: Annotated[float, Field(ge=0, le=1)] = 0.5
+    """Share of the devices among the fifth of the junctions with the densest traffic; the others are off them."""
+    span_m: _Positive = 1500.0
+    """Side of the square around the middle of the origins that they are placed in."""
+    radius_m: _Positive = 100.0
+    """Roads within this distance of a device count for its weight."""
+
+
+class Place(Strict):
+    """A place and its evacuation."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=80)]
+    description: str = ""
+    network: NetworkSource
+    demand: Demand = Demand()
+    simulation: Simulation = Simulation()
+    devices: Placement = Placement()
+    device: tuple[Site, ...] = ()
+
+    @pydantic.model_validator(mode="after")
+    def _check(self) -> "Place":
+        names = [site.name for site in self.device]
+        if self.device and not 2 <= len(names) <= MOST_DEVICES:
+            raise ValueError(f"holds {len(names)} [[device]] tables; give 2 to {MOST_DEVICES}, or none")
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"device name {name!r} is given twice; names must differ")
+        return self
+
+
+def load_place(source: str | Path, overrides: dict[str, Any] | None = None) -> tuple[Place, Path]:
+    """Read a place that ships with the package, or a file; and the folder that its paths are relative to.
+
+    Args:
+        source: ``"albany"``, or the path of a ``.toml`` file.
+        overrides: tables of settings that go before those of the file, and a list of devices that replaces its own.
+
+    Raises:
+        TrafficError: the file is not there, is not TOML, or holds something that does not fit; one line.
+    """
+    if str(source) in shipped_places():
+        path = Path(str(PLACES / str(source) / "place.toml"))
+    else:
+        path = Path(source)
+        if not path.is_file():
+            raise TrafficError(
+                f"{source}: neither a file nor a shipped place; {nearest(str(source), shipped_places())}"
+            )
+    data = read_toml(path)
+    for table, settings in (overrides or {}).items():
+        data[table] = data.get(table, {}) | settings if isinstance(settings, dict) else settings
+    data.setdefault("name", path.stem)
+    return make_place(data, str(path)), path.parent
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """A TOML file.
+
+    Raises:
+        TrafficError: it cannot be read, or is not TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise TrafficError(f"{path}: cannot be read: {reason}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise TrafficError(f"{path}: not TOML: {error}") from None
+
+
+def make_place(data: dict[str, Any], source: str) -> Place:
+    """A checked place from plain data as a file holds it; ``source`` names it in messages.
+
+    Raises:
+        TrafficError: something does not fit; one line.
+    """
+    try:
+        return Place.model_validate(_with_tuples(data))
+    except pydantic.ValidationError as error:
+        raise TrafficError(one_line(source, error, Place)) from None
+
+
+def _with_tuples(value: Any) -> Any:
+    """Arrays of TOML as tuples, which is what the strict models want; whole numbers are numbers."""
+    if isinstance(value, dict):
+        return {name: _with_tuples(part) for name, part in value.items()}
+    return tuple(_with_tuples(part) for part in value) if isinstance(value, list) else value
