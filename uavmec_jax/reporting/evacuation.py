@@ -4,7 +4,7 @@ from typing import Any
 
 from rich.table import Table
 
-from uavmec_jax.traffic.evacuation import Evacuation
+from uavmec_jax.traffic.evacuation import HIGH_TRAFFIC, Evacuation
 
 
 def evacuation_table(evacuation: Evacuation) -> Table:
@@ -36,7 +36,7 @@ def evacuation_lines(evacuation: Evacuation) -> list[str]:
     width, height = evacuation.region_m()
     lines = [
         f"Means over {first:.0f} to {last:.0f} min after the order to leave and over {meta['seeds']} simulations; roads "
-        f"within {meta['radius_m']:g} m. Bold: at least half the weight of the busiest.",
+        f"within {meta['radius_m']:g} m. Bold: high traffic, a weight of {HIGH_TRAFFIC:g} or more.",
         f"{loaded:,} vehicles in all ({meta['vehicles']:,} evacuated in each), {unfinished:,} had not left at the end, "
         f"{teleports:,} were stuck and moved on. The devices span {width:,.0f} x {height:,.0f} m. SUMO {meta['sumo']}.",
     ]

@@ -14,8 +14,8 @@ from uavmec_jax.world.settings import nearest
 SCHEMA = 1
 """Version of the file."""
 
-PAPER_REGION_M = 800.0
-"""Side of the paper's region, which a place may be scaled to."""
+HIGH_TRAFFIC = 0.4
+"""Weight from which a device counts as in high traffic; in the places that ship with the package nobody is near it."""
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,8 @@ class Evacuation:
 
     @property
     def busy(self) -> np.ndarray:
-        """``[n]`` bool: devices in high traffic, those whose weight is at least half of the largest."""
-        return np.asarray(self.weight >= 0.5)
+        """``[n]`` bool: devices in high traffic, those that see at least :data:`HIGH_TRAFFIC` of the busiest's."""
+        return np.asarray(self.weight >= HIGH_TRAFFIC)
 
     @property
     def roads(self) -> list[np.ndarray]:
