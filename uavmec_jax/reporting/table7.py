@@ -6,11 +6,12 @@ import pandas as pd
 from rich.table import Table
 from rich.text import Text
 
-from uavmec_jax.reporting.words import half_interval
+from uavmec_jax.reporting.words import half_interval, place
 from uavmec_jax.studies.first_failures import LEARNED, first_failure_counts, traffic_claims
 from uavmec_jax.studies.paper import TABLE7
 from uavmec_jax.studies.results import Results
-from uavmec_jax.studies.schema import TRAFFIC_WEIGHTS
+from uavmec_jax.studies.schema import PLANNERS, TRAFFIC_WEIGHTS
+from uavmec_jax.studies.study import cell_axes
 
 _SHORT = {
     "oldest_first": "oldest",
@@ -33,11 +34,11 @@ def table7_tables(results: Results) -> dict[str, Table]:
     """First failures of each place's devices, lifetimes, and the test of the paper's claim."""
     counts = first_failure_counts(results)
     seeds = int(counts["seeds"].max())
-    shown = {
-        f"{place}: first failures of each device in {seeds} scenarios; best weights by what traffic weighs in their reward": (
-            counts_table(counts[counts["place"] == place])
+    shown = {"Lifetime in slots, mean over the seeds ± 95 %": lifetimes_table(results)} | {
+        f"{town}: first failures of each device in {seeds} scenarios; best weights by what traffic weighs in their reward": (
+            counts_table(counts[counts["place"] == town])
         )
-        for place in dict.fromkeys(counts["place"])
+        for town in dict.fromkeys(counts["place"])
     }
     claims = traffic_claims(results)
     if len(claims):
@@ -45,6 +46,27 @@ def table7_tables(results: Results) -> dict[str, Table]:
             claims_table(claims)
         )
     return shown
+
+
+def lifetimes_table(results: Results) -> Table:
+    """A line per cell: learned policies with their intervals, heuristics, planners."""
+    cells, table = results.cells(), Table()
+    axes = [axis for axis in cell_axes(results.study) if axis not in TRAFFIC_WEIGHTS]
+    axes = [axis for axis in axes if cells[axis].nunique() > 1 or axis in ("powered", "connected")]
+    learned = [name for name in LEARNED if name in cells]
+    others = [name for name in results.policies if name not in LEARNED]
+    planners = [f"{name}_planned" for name in PLANNERS if f"{name}_planned" in cells]
+    for axis in axes:
+        table.add_column(axis)
+    for name in ("traffic", *learned, *others, *planners):
+        shown = name.removesuffix("_planned")
+        table.add_column(_SHORT.get(shown, shown.replace("_", "-")), justify="left" if name == "traffic" else "right")
+    for cell in cells.to_dict("records"):
+        intervals = [half_interval(cell[f"{name}_low"], cell[f"{name}_high"]) for name in learned]
+        means = [f"{cell[name]:.1f}{half}" for name, half in zip(learned, intervals, strict=True)]
+        means += [f"{cell[name]:.1f}" for name in (*others, *planners)]
+        table.add_row(*place(cell, axes), traffic_words(cell), *means)
+    return table
 
 
 def columns_of(counts: pd.DataFrame) -> dict[str, pd.DataFrame]:

@@ -27,8 +27,7 @@ def tables(results: Results) -> dict[str, Table]:
     """The tables of a run by title: Tables 5 to 7 where the study is like theirs, else a list of cells."""
     cells = results.cells()
     if has_places(results):
-        lifetimes = {"Lifetime in slots, mean over the seeds ± 95 %": list_table(results, cells)}
-        return lifetimes | table7_tables(results)
+        return table7_tables(results)
     if is_table6(results):
         return table6_tables(cells)
     if not is_grid(results):

@@ -74,7 +74,7 @@ def _through(entries: list[Road], exits: list[Road], reached_from: list[set[str]
         return np.zeros((0, len(exits)))
     start = np.array([road.shape[0] for road in entries])
     metres = np.linalg.norm(start[:, None] - np.array([road.shape[-1] for road in exits]), axis=-1)
-    far = metres >= metres.max() / 4  # coming back on the other carriageway is no through traffic
+    far = (metres > 0) & (metres >= metres.max() / 4)  # coming back on the other carriageway is no through traffic
     fits = [
         [entry.kind == end.kind and entry.id in near for near, end in zip(reached_from, exits, strict=True)]
         for entry in entries

@@ -1,6 +1,7 @@
 """Road networks: made by netconvert from checked sources, kept by their hash, and read back as roads and junctions."""
 
 import hashlib
+import re
 import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -55,7 +56,7 @@ class RoadNetwork:
         roads: by id, in the order of the file.
         onward: road -> the roads that one can turn into at its end.
         junctions: id -> ``(x, y)`` m.
-        sha256: of the network file.
+        sha256: of the network file without its comments.
         file: where it is.
     """
 
@@ -198,7 +199,12 @@ def read_network(file: Path, name: str) -> RoadNetwork:
     junctions = {node.getID(): node.getCoord()[:2] for node in net.getNodes() if node.getID() in used}
     if not roads or len(junctions) < 2:
         raise TrafficError(f"{name}: has no junctions with roads for cars between them")
-    return RoadNetwork(roads, onward, junctions, hashlib.sha256(file.read_bytes()).hexdigest(), file)
+    return RoadNetwork(roads, onward, junctions, _digest(file), file)
+
+
+def _digest(file: Path) -> str:
+    """SHA-256 of a network without its comments: netconvert writes the date of the day into one."""
+    return hashlib.sha256(re.sub(rb"<!--.*?-->", b"", file.read_bytes(), flags=re.DOTALL)).hexdigest()
 
 
 def _road(edge: Any) -> Road:

@@ -103,22 +103,22 @@ class _RefusedError(Exception):
     """A file holds what it should not."""
 
 
-def _decompressed(raw: IO[bytes]) -> IO[bytes]:
+def _decompressed(raw: IO[bytes]) -> Any:
     magic = raw.read(3)
     raw.seek(0)
     if magic[:2] == b"\x1f\x8b":
-        return gzip.GzipFile(fileobj=raw)  # type: ignore[return-value]
+        return gzip.GzipFile(fileobj=raw)
     return bz2.BZ2File(raw) if magic == b"BZh" else raw
 
 
 class _Tee:
     """Reads a file and writes what was read to another one."""
 
-    def __init__(self, source: IO[bytes], copy: IO[bytes]):
+    def __init__(self, source: Any, copy: IO[bytes]):
         self._source, self._copy, self._bytes = source, copy, 0
 
     def read(self, size: int = -1) -> bytes:
-        chunk = self._source.read(size)
+        chunk: bytes = self._source.read(size)
         self._bytes += len(chunk)
         if self._bytes > MOST_BYTES:
             raise _RefusedError(f"is longer than {MOST_BYTES / 2**30:g} GiB; cut it to the town first")

@@ -78,4 +78,8 @@ def _counts(path: Path) -> dict[str, int]:
 
 
 if __name__ == "__main__":
-    simulate(json.loads(Path(sys.argv[1]).read_text(encoding="utf-8")))
+    try:
+        simulate(json.loads(Path(sys.argv[1]).read_text(encoding="utf-8")))
+    except Exception as error:  # SUMO's own, over several lines; it has already said what it has no words for here
+        words = " ".join(str(error).split())
+        sys.exit(f"Error: {words}" if words and "proxy of" not in words else 1)

@@ -1,0 +1,115 @@
+"""Where devices stand, and what they see."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from tests.traffic.towns import road, village
+from uavmec_jax.errors import TrafficError
+from uavmec_jax.traffic.demand import find_routes
+from uavmec_jax.traffic.devices import farthest_points, place_devices
+from uavmec_jax.traffic.network import RoadNetwork
+from uavmec_jax.traffic.place import Demand, make_place
+from uavmec_jax.traffic.weights import density_near, length_within, scaled
+
+LINE = np.array([[-1000.0, 0.0], [1000.0, 0.0]])
+
+
+def test_length_of_a_straight_road_in_a_circle():
+    centres = np.array([[0.0, 0.0], [0.0, 60.0], [0.0, 100.0], [0.0, 150.0], [1000.0, 0.0], [2000.0, 0.0]])
+    assert_allclose(length_within(LINE, centres, 100.0), [200, 160, 0, 0, 100, 0], atol=1e-9)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    corners=st.lists(st.tuples(st.floats(-300, 300), st.floats(-300, 300)), min_size=2, max_size=5),
+    x=st.floats(-200, 200),
+    y=st.floats(-200, 200),
+)
+def test_length_in_a_circle_against_small_steps(corners, x, y):
+    shape = np.array(corners)
+    pieces = [np.linspace(a, b, 2001) for a, b in zip(shape, shape[1:], strict=False)]
+    brute = sum(
+        np.linalg.norm(piece[1] - piece[0])
+        * (np.linalg.norm((piece[1:] + piece[:-1]) / 2 - [x, y], axis=1) <= 120).sum()
+        for piece in pieces
+    )
+    found = length_within(shape, np.array([[x, y]]), 120.0)[0]
+    assert found == pytest.approx(brute, abs=1.0 * len(pieces) + 1e-3)
+    assert found >= 0
+
+
+def test_density_is_a_mean_over_lanes_and_metres():
+    # 200 m of a road with 3 lanes at 10 vehicles/km/lane, 100 m of one with 1 lane at 50: (600 * 10 + 100 * 50) / 700.
+    shapes = [LINE, np.array([[0.0, 0.0], [0.0, 1000.0]])]
+    near = density_near(
+        np.array([[0.0, 0.0], [5000.0, 0.0]]), shapes, np.array([3, 1]), np.array([[10.0, 50.0]]), 100.0
+    )
+    assert_allclose(near, [[11_000 / 700, 0.0]])
+
+
+def test_weights_are_between_0_and_1():
+    assert_allclose(scaled(np.array([2.0, 8.0, 0.0])), [0.25, 1, 0])
+    assert_allclose(scaled(np.zeros(3)), 0)
+
+
+def test_farthest_points_spread():
+    position = np.array([[0.0, 0], [1, 0], [2, 0], [10, 0], [11, 0]])
+    assert farthest_points(position, np.arange(5), 2, []) == [4, 0]
+    assert farthest_points(position, np.arange(4), 3, [4]) == [4, 0, 2, 1]
+    assert farthest_points(position, np.array([1]), 3, [0]) == [0, 1]
+
+
+def grid():
+    """5 x 5 junctions 100 m apart; the traffic is on the southern street, which a highway continues."""
+    places = {f"{x}{y}": (100.0 * x, 100.0 * y) for x in range(5) for y in range(5)} | {"out": (900.0, 0.0)}
+    pairs = [(f"{x}{y}", f"{x + 1}{y}") for x in range(4) for y in range(5)]
+    pairs += [(f"{x}{y}", f"{x}{y + 1}") for x in range(5) for y in range(4)]
+    roads = [road(a, b, "residential", places) for one in pairs for a, b in (one, one[::-1])]
+    roads.append(road("40", "out", "primary", places))
+    onward = {one.id: tuple(other.id for other in roads if other.start == one.end) for one in roads}
+    return RoadNetwork({one.id: one for one in roads}, onward, places, "", Path("none"))
+
+
+def placed(network, **devices):
+    place = make_place({"name": "g", "network": {"net": "x"}, "devices": devices}, "g")
+    density = np.array(
+        [40.0 if one.start.endswith("0") and one.end.endswith("0") else 1.0 for one in network.roads.values()]
+    )
+    return place_devices(place, network, find_routes(network, Demand(), "g"), density)
+
+
+def test_a_stated_share_stands_on_the_corridors():
+    network = grid()
+    names, position = placed(network, count=6, corridor_share=0.5, span_m=900.0, radius_m=60.0)
+    assert len(set(names)) == 6
+    assert sum(name.endswith("0") for name in names) == 3
+    assert position.shape == (6, 2)
+    names, _ = placed(network, count=6, corridor_share=0.0, span_m=900.0, radius_m=60.0)
+    assert not any(name.endswith("0") for name in names)
+
+
+def test_more_devices_than_junctions():
+    with pytest.raises(
+        TrafficError, match=r"g: 30 devices, but 25 junctions in the 900 m around where people live \(26 in"
+    ):
+        placed(grid(), count=30, span_m=900.0)
+
+
+def test_sites_of_a_file():
+    sites = [{"name": "a", "junction": "east"}, {"name": "b", "x_m": 5.0, "y_m": 6.0}]
+    place = make_place({"name": "v", "network": {"net": "x"}, "device": sites}, "v")
+    network = village()
+    names, position = place_devices(place, network, find_routes(network, Demand(), "v"), np.zeros(len(network.roads)))
+    assert names == ["a", "b"]
+    assert_allclose(position, [[200, 0], [5, 6]])
+    sites[0]["junction"] = "esat"
+    place = make_place({"name": "v", "network": {"net": "x"}, "device": sites}, "v")
+    with pytest.raises(
+        TrafficError, match="v: device 'a': junction is 'esat', which does not exist; did you mean 'west'"
+    ):
+        place_devices(place, network, find_routes(network, Demand(), "v"), np.zeros(len(network.roads)))

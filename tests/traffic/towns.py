@@ -1,0 +1,115 @@
+"""Small road networks whose answers are known, and extracts and evacuations made of them."""
+
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+from uavmec_jax.traffic.evacuation import Evacuation
+from uavmec_jax.traffic.network import Road, RoadNetwork
+
+LIVES = ("west", "middle", "east")
+"""Junctions of a village street, 100 m apart; a primary road leads 500 m from the east one to the exit."""
+
+
+def road(start, end, kind, places, lanes=1):
+    shape = np.array([places[start], places[end]], float)
+    return Road(f"{start}-{end}", kind, lanes, 13.4, float(np.linalg.norm(shape[1] - shape[0])), start, end, shape)
+
+
+def village(exit_kind="primary", cut=False) -> RoadNetwork:
+    """A village street with a highway to the south, and a loop road that nothing leads out of.
+
+    ``cut``: the village itself has no way to the highway.
+    """
+    places = {
+        "west": (0, 0),
+        "middle": (100, 0),
+        "east": (200, 0),
+        "south": (200, -500),
+        "loop": (900, 0),
+        "end": (900, 300),
+    }
+    pairs = [("west", "middle"), ("middle", "east")]
+    roads = [road(a, b, "residential", places) for one in pairs for a, b in (one, one[::-1])]
+    roads += [road("loop", "end", "residential", places), road("end", "loop", "residential", places)]
+    roads += [road("east", "south", exit_kind, places, lanes=2), road("south", "east", exit_kind, places, lanes=2)]
+    named = {one.id: one for one in roads}
+    onward = {
+        one.id: tuple(
+            other.id
+            for other in roads
+            if other.start == one.end
+            and not (cut and {one.end, other.start} == {"east"} and "south" in (one.start, other.end))
+        )
+        for one in roads
+    }
+    return RoadNetwork(
+        named, onward, {name: (float(x), float(y)) for name, (x, y) in places.items()}, "0" * 64, Path("none")
+    )
+
+
+def evacuation(
+    weight=(1.0, 0.5, 0.1), windows=((0.0, 0.2, 0.1), (1.0, 0.4, 0.1)), name="hamlet", span=300.0
+) -> Evacuation:
+    """An evacuation of invented densities: devices on a diagonal, two roads."""
+    weight, windows = np.array(weight, np.float32), np.array(windows, np.float32)
+    n = len(weight)
+    meta = {
+        "place": name,
+        "description": "invented",
+        "names": [f"site {k + 1}" for k in range(n)],
+        "roads": ["a", "b"],
+        "window_s": 600.0,
+        "mean_s": [0.0, 600.0 * len(windows)],
+        "mean_windows": [0, len(windows)],
+        "radius_m": 100.0,
+        "vehicles": 10,
+        "seeds": 2,
+        "loaded": [10, 10],
+        "unfinished": [0, 1],
+        "teleports": [0, 0],
+        "cut_off": 1,
+        "warnings": ["5% of the vehicles had not left at the end; simulate longer"],
+        "sumo": "1.28.0",
+        "network_sha256": "0" * 64,
+        "command": "",
+        "settings": {},
+    }
+    return Evacuation(
+        meta=meta,
+        position=np.linspace(0, span, n)[:, None].astype(np.float32) * np.array([1, 0.5], np.float32) + 1000,
+        density=weight * 20,
+        density_spread=weight,
+        weight=weight,
+        window_weight=windows,
+        road_shape=np.array([[1000, 1000], [1100, 1000], [1000, 1000], [1000, 1200], [1050, 1250]], np.float32),
+        road_corners=np.array([2, 3], np.int32),
+        road_lanes=np.array([1, 2], np.int32),
+        road_density=np.array([[0.0, 30.0], [4.0, 50.0]], np.float32),
+    )
+
+
+def osm_town(rows=4, columns=4, spacing=0.0015) -> str:
+    """An OpenStreetMap extract: a grid of residential streets between 9.70 E, 50.00 N and a motorway's two carriageways."""
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>', '<osm version="0.6" generator="by hand">']
+    number = {}
+    for row, column in product(range(rows), range(columns)):
+        number[row, column] = 100 + row * columns + column
+        lat, lon = 50.0 + row * spacing, 9.7 + column * spacing
+        lines.append(f'<node id="{number[row, column]}" lat="{lat:.6f}" lon="{lon:.6f}"/>')
+    east = 9.7 + (columns - 1) * spacing
+    highway = {900: (49.99, east + 0.004), 901: (50.0, east + 0.004), 902: (50.02, east + 0.004)}
+    highway |= {910: (50.02, east + 0.0045), 911: (50.0, east + 0.0045), 912: (49.99, east + 0.0045)}
+    lines += [f'<node id="{k}" lat="{lat:.6f}" lon="{lon:.6f}"/>' for k, (lat, lon) in highway.items()]
+    ways = [([number[row, column] for column in range(columns)], "residential", "no") for row in range(rows)]
+    ways += [([number[row, column] for row in range(rows)], "residential", "no") for column in range(columns)]
+    ways += [([900, 901, 902], "motorway", "yes"), ([910, 911, 912], "motorway", "yes")]
+    ways += [
+        ([number[0, columns - 1], 901], "motorway_link", "yes"),
+        ([911, number[0, columns - 1]], "motorway_link", "yes"),
+    ]
+    for k, (nodes, kind, oneway) in enumerate(ways):
+        lines.append(f'<way id="{500 + k}">' + "".join(f'<nd ref="{node}"/>' for node in nodes))
+        lines.append(f'<tag k="highway" v="{kind}"/><tag k="oneway" v="{oneway}"/></way>')
+    return "\n".join([*lines, "</osm>"])
