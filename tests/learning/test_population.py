@@ -1,6 +1,9 @@
 """The population: blocks, looks, curves, devices, learning."""
 
+from dataclasses import replace
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -9,8 +12,12 @@ from tests.learning.agents import make_agent, stack
 from uavmec_jax.learning import dqn, population
 from uavmec_jax.learning.blocks import Blocks, PopulationTooLargeError, plan_blocks
 from uavmec_jax.learning.dqn import DQNSpec
-from uavmec_jax.learning.population import Validation
+from uavmec_jax.learning.population import Best, Validation, _look
 from uavmec_jax.planning.heuristics import HEURISTICS
+from uavmec_jax.world.environment import make_scenario
+from uavmec_jax.world.layout import Traffic, sample_layout
+from uavmec_jax.world.params import Params
+from uavmec_jax.world.rewards import make_reward
 from uavmec_jax.world.rollout import rollouts
 
 GIB = 2**30
@@ -126,3 +133,22 @@ def test_dqn_learns_to_beat_random_by_far():
 
     ours, random = jax.vmap(lifetimes)(agents, block.best, keys)
     assert ours.mean() > 1.4 * random.mean()
+
+
+@pytest.mark.parametrize("paid", [False, True])
+def test_the_best_look_is_the_longest_life_or_what_pays_most(paid):
+    """Staying at device 1 lives as long as staying at device 2, but device 2 is where the traffic is."""
+    scenario = make_scenario(layout=sample_layout(jax.random.key(5), Params(), 12, 12))
+    weight = jnp.zeros((1, 12)).at[0, 1].set(1.0)
+    reward = make_reward("U", traffic_bonus=2.0 if paid else 0.0)
+    scenario = replace(scenario, layout=replace(scenario.layout, traffic=Traffic(weight)), reward=reward)
+    stays = replace(dqn.algorithm(DQNSpec(total_steps=200)), greedy=lambda hyper, device, observation: device)
+    agent = replace(make_agent(), scenario=scenario)
+    best = Best(jnp.int32(7), jnp.float32(-jnp.inf), jnp.int32(0))
+    keys = jax.random.split(jax.random.key(0), 2)
+    first, best = _look(stays, agent, keys, jnp.int32(0), best, 10)
+    second, best = _look(stays, agent, keys, jnp.int32(1), best, 20)
+    earned = 33 * 34 / 2 + 33  # the slot that the UAV's battery cannot pay for is the 34th decision, with U = 33
+    assert first == (earned if paid else 33)
+    assert second == (earned + 2 * 34 if paid else 33)
+    assert (int(best.weights), int(best.step)) == ((1, 20) if paid else (0, 10))

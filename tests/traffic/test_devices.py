@@ -1,5 +1,6 @@
 """Where devices stand, and what they see."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,7 @@ def test_length_of_a_straight_road_in_a_circle():
 )
 def test_length_in_a_circle_against_small_steps(corners, x, y):
     shape = np.array(corners)
-    pieces = [np.linspace(a, b, 2001) for a, b in zip(shape, shape[1:], strict=False)]
+    pieces = [np.linspace(a, b, 2001) for a, b in pairwise(shape)]
     brute = sum(
         np.linalg.norm(piece[1] - piece[0])
         * (np.linalg.norm((piece[1:] + piece[:-1]) / 2 - [x, y], axis=1) <= 120).sum()

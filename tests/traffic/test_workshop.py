@@ -30,9 +30,9 @@ def test_it_runs_in_a_folder_that_goes_away():
 def test_failures_tell_the_last_error():
     code = "import sys; sys.stderr.write('Warning: a\\nError: the road is cut\\nQuitting (on error).\\n'); sys.exit(1)"
     with Workshop() as workshop:
-        with pytest.raises(TrafficError, match="^netconvert: the road is cut$"):
+        with pytest.raises(TrafficError, match=r"^netconvert: the road is cut$"):
             workshop.run("netconvert", python(code), limit_s=20)
-        with pytest.raises(TrafficError, match="^p: ended with exit code 3$"):
+        with pytest.raises(TrafficError, match=r"^p: ended with exit code 3$"):
             workshop.run("p", python("raise SystemExit(3)"), limit_s=20)
         with pytest.raises(TrafficError, match=r"^p: ended with exit code -9$"):
             workshop.run("p", python("import os; os.kill(os.getpid(), 9)"), limit_s=20)
@@ -57,9 +57,9 @@ def test_nothing_is_left_behind_when_killed(tmp_path, how):
 import sys
 from pathlib import Path
 from uavmec_jax.traffic.workshop import Workshop
-sleeper = "import os, time; open('pid', 'w').write(str(os.getpid())); os.rename('pid', {str(tmp_path / "pid")!r}); time.sleep(600)"
+sleeper = "import os, time; open('pid', 'w').write(str(os.getpid())); os.rename('pid', '{tmp_path}/pid'); time.sleep(600)"
 with Workshop() as workshop:
-    Path({str(tmp_path / "folder")!r}).write_text(str(workshop.folder))
+    Path("{tmp_path}/folder").write_text(str(workshop.folder))
     workshop.run("p", [sys.executable, "-c", sleeper], limit_s=600)
 """
     process = subprocess.Popen(python(code), stderr=subprocess.DEVNULL)

@@ -1,0 +1,63 @@
+"""Road maps and animations."""
+
+import jax
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgba
+from numpy.testing import assert_allclose
+from PIL import Image
+
+from tests.traffic.towns import evacuation
+from uavmec_jax.planning.heuristics import HEURISTICS
+from uavmec_jax.reporting.animation import save_animation
+from uavmec_jax.reporting.canvas import new_figure, save
+from uavmec_jax.reporting.evacuation import evacuation_data, evacuation_lines
+from uavmec_jax.reporting.road_map import COLOURS, LIMITS, colour_of, draw_roads, map_figure
+from uavmec_jax.studies.places import on_place
+from uavmec_jax.traffic.evacuation import load_evacuation
+from uavmec_jax.world.layout import sample_layout
+from uavmec_jax.world.params import Params
+
+
+def test_seven_colours_in_the_papers_order():
+    assert COLOURS == ("blue", "cyan", "yellow", "green", "orange", "red", "magenta")
+    assert colour_of(np.array([0.0, *LIMITS])) == list(COLOURS)
+    assert colour_of(np.array([1.99, 59.9])) == ["blue", "red"]
+
+
+def test_the_densest_roads_are_drawn_on_top_in_their_colours():
+    axis = new_figure(3, 3).subplots()
+    lines = draw_roads(axis, evacuation(), np.array([70.0, 3.0]))
+    assert_allclose(lines.get_colors(), [to_rgba("cyan"), to_rgba("magenta")])
+    assert_allclose(lines.get_segments()[1], [[0, 0], [100, 0]])  # from the corner where the UAV starts
+
+
+def test_map_of_a_shipped_place(tmp_path):
+    figure = map_figure(load_evacuation("round_lake"))
+    texts = {text.get_text() for text in figure.axes[0].texts}
+    assert {str(number) for number in range(1, 13)} <= texts
+    save(figure, tmp_path / "map.png")
+    assert (tmp_path / "map.png").stat().st_size > 20_000
+
+
+def test_words_and_data():
+    lines = evacuation_lines(evacuation())
+    assert any("1 had not left" in line for line in lines)
+    assert any(line.startswith("1 residential roads have no way") for line in lines)
+    assert lines[-1] == "Warning: 5% of the vehicles had not left at the end; simulate longer."
+    data = evacuation_data(evacuation())
+    assert [device["high_traffic"] for device in data["devices"]] == [True, True, False]
+    assert data["devices"][1]["window_weight"] == [0.2, 0.4]
+
+
+@pytest.mark.slow
+def test_animation_has_a_frame_for_each_slot(tmp_path):
+    place, params = evacuation(), Params(n_devices=3)
+    layout = on_place(sample_layout(jax.random.key(0), params, 1, 1), place, moving=True)
+    path = tmp_path / "evacuation.gif"
+    slots = save_animation(path, place, params, layout, HEURISTICS["oldest-first"], jax.random.key(1), "hamlet")
+    assert slots >= 10
+    with Image.open(path) as image:
+        assert image.is_animated
+        assert slots <= image.n_frames <= slots + 4  # the end stays a while; equal frames are kept as one
+    assert [file.name for file in tmp_path.iterdir()] == ["evacuation.gif"]

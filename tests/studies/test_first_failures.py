@@ -1,0 +1,117 @@
+"""Who fails first, and the test of the paper's claim, on invented failures."""
+
+import io
+
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.testing import assert_allclose
+from rich.console import Console
+from scipy import stats
+
+from uavmec_jax.reporting import canvas, figures
+from uavmec_jax.reporting.tables import tables
+from uavmec_jax.studies.first_failures import first_failure_counts, high_traffic_share, traffic_claims
+from uavmec_jax.studies.paper import TABLE7
+from uavmec_jax.studies.places import describe_places
+from uavmec_jax.studies.results import Results
+from uavmec_jax.studies.statistics import sign_test
+from uavmec_jax.studies.study import identities, load_study
+
+
+@pytest.fixture(scope="module")
+def results():
+    """Ten seeds: everywhere device 2 (high traffic in both places) fails first, but with a penalty device 9, at a slot's
+    price; seed 0 is stubborn. The bonus changes nothing."""
+    study = load_study("table7", {"axes.seeds": 10})
+    agents = pd.DataFrame(identities(study))
+    spared = (agents.traffic_penalty > 0) & (agents.seed > 0)
+    share = np.zeros((len(agents), 3, 12), np.float32)
+    share[np.arange(len(agents)), :, np.where(spared, 8, 1)] = 1
+    evaluation, columns = {}, {}
+    for policy in ("best", "last", "oldest_first"):
+        columns |= {f"{policy}_lifetime": 20.0 - spared, f"{policy}_lifetime_fixed": 20.0}
+        evaluation[f"{policy}/first_failure"] = share
+    evaluation["rollout/first_failure"] = share[:, :1]
+    return Results(
+        study=study,
+        run={"places": describe_places(study)},
+        agents=agents.assign(**columns, rollout_planned=21.0),
+        curves={"dqn": {}},
+        evaluation=evaluation,
+    )
+
+
+def test_counts_add_up_to_the_scenarios(results):
+    counts = first_failure_counts(results)
+    assert set(counts["policy"]) == {"best", "last", "oldest_first", "rollout"}
+    sums = counts.groupby(["place", "traffic_penalty", "traffic_bonus", "policy"])["count"].sum()
+    assert len(sums) == 2 * 4 * 4
+    assert_allclose(sums, 10)
+    own = counts.query("place == 'albany' and policy == 'best' and traffic_penalty == 300 and traffic_bonus == 0")
+    assert own.set_index("device")["count"].loc[[2, 9]].tolist() == [1, 9]
+    assert own.set_index("device")["high_traffic"].loc[[2, 9]].tolist() == [True, False]
+
+
+def test_share_on_devices_in_high_traffic(results):
+    share = high_traffic_share(results, "best")
+    assert_allclose(share, np.where((results.agents.traffic_penalty > 0) & (results.agents.seed > 0), 0, 1))
+
+
+def test_the_claim_is_tested_seed_by_seed(results):
+    claims = traffic_claims(results).set_index(["policy", "place", "traffic_penalty", "traffic_bonus"])
+    assert len(claims) == 2 * 3 * 3
+    fined = claims.loc[("best", "all places", 300.0, 0.0)]
+    assert (fined["fewer"], fined["more"], fined["same"]) == (9, 0, 1)
+    assert_allclose(fined["p_value"], 2 / 2**9)
+    assert_allclose([fined["share_without"], fined["share"], fined["difference"]], [1, 0.1, -0.9])
+    assert fined["low"] <= -0.9 <= fined["high"]
+    assert_allclose([fined["g"], fined["slots"]], [0.5, -0.9])
+    paid = claims.loc[("best", "albany", 0.0, 10.0)]
+    assert (paid["same"], paid["p_value"], paid["g"], paid["difference"]) == (10, 1, 0, 0)
+
+
+def test_without_agents_to_hold_it_against_there_is_no_claim(results):
+    alone = Results(
+        study=load_study("table7", {"axes.seeds": 10, "axes.traffic_penalty": [300.0], "axes.traffic_bonus": [0.0]}),
+        run=results.run,
+        agents=results.agents.query("traffic_penalty > 0 and traffic_bonus == 0").reset_index(drop=True),
+        evaluation={name: leaf[:20] for name, leaf in results.evaluation.items()},
+    )
+    assert traffic_claims(alone).empty
+
+
+def test_tables_like_the_papers(results):
+    console = Console(width=160, record=True, file=io.StringIO())
+    shown = tables(results)
+    assert len(shown) == 4
+    for table in shown.values():
+        console.print(table)
+    text = console.export_text()
+    for words in ("failure 300", "visit 10 + failure 300", "oldest", "paper", "9/0/1", "0.0039", "+0.50"):
+        assert words in text
+    high = next(line for line in text.splitlines() if line.startswith("│ high"))
+    assert [word.strip() for word in high.strip("│").split("│")] == [
+        "high", "", "10.0", "10.0", "1.0", "1.0", "10.0", "10.0", "0"
+    ]  # fmt: skip
+
+
+def test_the_papers_counts():
+    assert {name: sum(counts) for name, counts in TABLE7.items()} == {"round_lake": 30, "albany": 30}
+
+
+def test_figure(results, tmp_path):
+    canvas.save(figures.run_figure(results), tmp_path / "figure.png")
+    assert (tmp_path / "figure.png").stat().st_size > 50_000
+
+
+def test_sign_test_is_the_exact_one():
+    differences = np.array([-1, -1, -0.5, 0, 0.25, -2, 0, -1e-9])
+    found = sign_test(differences)
+    assert (found.fewer, found.more, found.same) == (4, 1, 3)
+    assert_allclose(found.p_value, stats.binomtest(4, 5).pvalue)
+    assert_allclose(found.g, 0.3)
+    # Under chance p-values are not too small: exact, so at most 5 % of them are below 0.05.
+    rng = np.random.default_rng(0)
+    p_values = [sign_test(rng.choice([-1.0, 0.0, 1.0], 30)).p_value for _ in range(400)]
+    assert np.mean(np.array(p_values) < 0.05) <= 0.06
