@@ -62,3 +62,11 @@ def test_benchmark_planning(tmp_path):
     assert len(rows) == 4 * 3
     means = {(row["powered"], row["planner"]): row["mean"] for row in rows}
     assert all(means[powered, "beam 8"] <= means[powered, "bound"] for powered in (12, 10, 8, 4))
+
+
+def test_table7_evacuation(tmp_path):
+    out = run("table7_evacuation.py", "--seeds", 1, "--steps", 400, "--out", tmp_path / "table7")
+    assert "round_lake: first failures of each device" in out
+    assert (tmp_path / "table7" / "figure.png").exists()
+    pictures = {file.name for file in (tmp_path / "table7-pictures").iterdir()}
+    assert pictures == {"round_lake.png", "round_lake.gif", "albany.png", "albany.gif"}

@@ -1,6 +1,7 @@
 from .errors import LayoutError as LayoutError
 from .errors import PolicyError as PolicyError
 from .errors import StudyError as StudyError
+from .errors import TrafficError as TrafficError
 from .learning.a2c import A2CHyper as A2CHyper
 from .learning.a2c import A2CSpec as A2CSpec
 from .learning.algorithm import Agent as Agent
@@ -15,6 +16,7 @@ from .planning.heuristics import HEURISTICS as HEURISTICS
 from .planning.lookahead import rollout_planner as rollout_planner
 from .planning.outlook import Outlook as Outlook
 from .planning.outlook import look_ahead as look_ahead
+from .studies.places import on_place as on_place
 from .studies.policies import TrainedPolicy as TrainedPolicy
 from .studies.policies import load_policy as load_policy
 from .studies.results import Results as Results
@@ -22,6 +24,10 @@ from .studies.results import load_results as load_results
 from .studies.run import run_study as run_study
 from .studies.schema import Study as Study
 from .studies.study import load_study as load_study
+from .traffic.build import build_evacuation as build_evacuation
+from .traffic.evacuation import Evacuation as Evacuation
+from .traffic.evacuation import load_evacuation as load_evacuation
+from .traffic.place import load_place as load_place
 from .world.environment import Scenario as Scenario
 from .world.environment import UavMecEnv as UavMecEnv
 from .world.environment import advance as advance
@@ -30,6 +36,7 @@ from .world.environment import observe as observe
 from .world.inventory import Inventory as Inventory
 from .world.inventory_files import load_inventory as load_inventory
 from .world.layout import Layout as Layout
+from .world.layout import Traffic as Traffic
 from .world.layout import make_layout as make_layout
 from .world.layout import sample_layout as sample_layout
 from .world.params import Params as Params

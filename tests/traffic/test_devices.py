@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 from tests.traffic.towns import road, village
 from uavmec_jax.errors import TrafficError
 from uavmec_jax.traffic.demand import find_routes
-from uavmec_jax.traffic.devices import farthest_points, place_devices
+from uavmec_jax.traffic.devices import _named, farthest_points, place_devices
 from uavmec_jax.traffic.network import RoadNetwork
 from uavmec_jax.traffic.place import Demand, make_place
 from uavmec_jax.traffic.weights import density_near, length_within, scaled
@@ -92,6 +92,15 @@ def test_a_stated_share_stands_on_the_corridors():
     assert position.shape == (6, 2)
     names, _ = placed(network, count=6, corridor_share=0.0, span_m=900.0, radius_m=60.0)
     assert not any(name.endswith("0") for name in names)
+
+
+def test_devices_are_called_after_their_streets():
+    places = {"a": (0, 0), "b": (100, 0), "c": (200, 0), "d": (200, 100), "e": (300, 0)}
+    pairs = {"ab": "High Street", "bc": "High Street", "cd": "Mill Lane", "ce": ""}
+    roads = [road(*pair, "residential", places, name=name) for pair, name in pairs.items()]
+    network = RoadNetwork({one.id: one for one in roads}, {}, places, "", Path("none"))
+    assert _named(["a", "c", "d", "e"], network) == ["High Street", "High Street and Mill Lane", "Mill Lane", "e"]
+    assert _named(["a", "b"], network) == ["High Street (a)", "High Street (b)"]
 
 
 def test_more_devices_than_junctions():

@@ -12,9 +12,11 @@ LIVES = ("west", "middle", "east")
 """Junctions of a village street, 100 m apart; a primary road leads 500 m from the east one to the exit."""
 
 
-def road(start, end, kind, places, lanes=1):
+def road(start, end, kind, places, lanes=1, name=""):
     shape = np.array([places[start], places[end]], float)
-    return Road(f"{start}-{end}", kind, lanes, 13.4, float(np.linalg.norm(shape[1] - shape[0])), start, end, shape)
+    return Road(
+        f"{start}-{end}", name, kind, lanes, 13.4, float(np.linalg.norm(shape[1] - shape[0])), start, end, shape
+    )
 
 
 def village(exit_kind="primary", cut=False) -> RoadNetwork:

@@ -12,6 +12,7 @@ from uavmec_jax.reporting.table7 import columns_of
 from uavmec_jax.studies.first_failures import first_failure_counts
 from uavmec_jax.studies.paper import TABLE7
 from uavmec_jax.studies.results import Results
+from uavmec_jax.studies.schema import PLANNERS
 from uavmec_jax.traffic.evacuation import load_evacuation
 
 
@@ -36,7 +37,8 @@ def table7_figure(results: Results) -> Figure:
 
 def draw_bars(axis: Axes, counts: pd.DataFrame) -> None:
     """First failures of one place's devices, a bar for each way to play; devices in high traffic are shaded."""
-    columns = {name: own["count"].to_numpy() for name, own in columns_of(counts).items()}
+    shown = counts[~counts["policy"].isin(PLANNERS)]  # the table has them; more bars than these cannot be told apart
+    columns = {name: own["count"].to_numpy() for name, own in columns_of(shown).items()}
     place = str(counts["place"].iloc[0])
     if place in TABLE7:
         columns["paper"] = np.array(TABLE7[place], float)

@@ -29,7 +29,14 @@ def place_devices(
     if place.device:
         return [site.name for site in place.device], np.array([_of(site, network, place.name) for site in place.device])
     chosen = _chosen(place.name, place.devices, network, _middle(routes), density)
-    return chosen, np.array([network.junctions[junction] for junction in chosen])
+    return _named(chosen, network), np.array([network.junctions[junction] for junction in chosen])
+
+
+def _named(junctions: list[str], network: RoadNetwork) -> list[str]:
+    """A name for each junction: the streets that meet there, with its id where two have the same; or the id."""
+    streets = [" and ".join(network.streets_at(junction)[:2]) or junction for junction in junctions]
+    twice = {name for name in streets if streets.count(name) > 1}
+    return [f"{name} ({own})" if name in twice else name for name, own in zip(streets, junctions, strict=True)]
 
 
 def _of(site: Site, network: RoadNetwork, name: str) -> tuple[float, float]:

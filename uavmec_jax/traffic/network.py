@@ -30,15 +30,16 @@ _PLAIN_OPTIONS = ("--offset.disable-normalization", "true")
 _OSM_OPTIONS = (
     *("--keep-edges.by-vclass", "passenger", "--remove-edges.isolated", "true", "--geometry.remove", "true"),
     *("--junctions.join", "true", "--tls.guess-signals", "true", "--tls.discard-simple", "true"),
-    *("--osm.all-attributes", "false", "--no-turnarounds.except-deadend", "true"),
+    *("--output.street-names", "true", "--no-turnarounds.except-deadend", "true"),
 )
 
 
 @dataclass(frozen=True)
 class Road:
-    """One direction of a road between two junctions; ``shape`` is ``[k, 2]`` m."""
+    """One direction of a road between two junctions; ``shape`` is ``[k, 2]`` m, ``name`` may be empty."""
 
     id: str
+    name: str
     kind: str
     lanes: int
     speed_m_s: float
@@ -88,6 +89,11 @@ class RoadNetwork:
     def into(self, junction: str) -> list[Road]:
         """The roads that end at a junction, the widest first."""
         return sorted((road for road in self.roads.values() if road.end == junction), key=lambda road: -road.lanes)
+
+    def streets_at(self, junction: str) -> list[str]:
+        """Names of the roads that meet at a junction, each once."""
+        named = (road.name for road in self.roads.values() if junction in (road.start, road.end) and road.name)
+        return list(dict.fromkeys(named))
 
     def is_end(self, road: Road) -> bool:
         """Whether nothing but the way back goes on from a road."""
@@ -210,6 +216,7 @@ def _digest(file: Path) -> str:
 def _road(edge: Any) -> Road:
     return Road(
         id=edge.getID(),
+        name=edge.getName() or "",
         kind=(edge.getType() or "").split("|")[0].rpartition(".")[2],
         lanes=edge.getLaneNumber(),
         speed_m_s=edge.getSpeed(),
