@@ -205,6 +205,15 @@ def test_the_command_from_end_to_end(town, tmp_path):
     assert "vehicles in all (150 evacuated in each)" in done.stdout
     told = json.loads(CliRunner().invoke(main, ["traffic", "show", str(out), "--json"]).stdout)
     assert len(told["devices"]) == 4
+    (tmp_path / "devices.toml").write_text(
+        '[[device]]\nname = "a"\nx_m = 0\ny_m = 0\n[[device]]\nname = "b"\nx_m = 200.0\ny_m = 50.0\n'
+    )
+    done = CliRunner().invoke(
+        main, [*command, "--seeds", "1", "--out", str(out), "--devices", str(tmp_path / "devices.toml")]
+    )
+    assert done.exit_code == 0, done.output
+    assert load_evacuation(out).meta["names"] == ["a", "b"]
+    assert load_evacuation(out).region_m() == (200, 50)
     assert told["meta"]["settings"]["network"]["bbox"] == [9.6, 49.9, 9.8, 50.1]
 
 

@@ -1,0 +1,50 @@
+"""What one simulation leaves is read as it is meant (SUMO itself is not started)."""
+
+import subprocess
+import sys
+
+import numpy as np
+from numpy.testing import assert_array_equal
+
+from uavmec_jax.traffic.simulation import Densities
+from uavmec_jax.traffic.worker import _counts, _densities
+
+DENSITY = """<meandata>
+  <interval begin="120.00" end="420.00" id="density">
+    <edge id="a" sampledSeconds="10.00" density="4.0" laneDensity="2.00"/>
+    <edge id="b" sampledSeconds="0.00" laneDensity=""/>
+    <edge id=":junction_0" laneDensity="99.0"/>
+  </interval>
+  <interval begin="420.00" end="720.00" id="density">
+    <edge id="b" sampledSeconds="3.00"/>
+    <edge id="c" laneDensity="7.5"/>
+  </interval>
+  <interval begin="720.00" end="730.00" id="density"><edge id="a" laneDensity="1.0"/></interval>
+</meandata>"""
+
+
+def test_empty_roads_have_density_0(tmp_path):
+    (tmp_path / "d.xml").write_text(DENSITY)
+    assert_array_equal(_densities(tmp_path / "d.xml", ["a", "b", "c"], 2), [[2, 0, 0], [0, 0, 7.5]])
+
+
+def test_counts(tmp_path):
+    text = '<statistics><vehicles loaded="9" running="2" waiting="1"/><teleports total="4" jam="3"/></statistics>'
+    (tmp_path / "s.xml").write_text(text)
+    assert _counts(tmp_path / "s.xml") == {"loaded": 9, "unfinished": 3, "teleports": 4}
+    assert set(_counts(tmp_path / "s.xml")) | {"density"} == set(Densities.__annotations__)
+
+
+def test_warnings_above_2_percent():
+    def found(unfinished, teleports):
+        two = lambda count: np.array([count, 0])  # noqa: E731
+        return Densities(np.zeros((2, 1, 1)), two(100) + two(100)[::-1], two(unfinished), two(teleports)).warnings()
+
+    assert found(4, 4) == []
+    assert found(5, 0) == ["2% of the vehicles had not left at the end; simulate longer"]
+    assert found(0, 5) == ["2.5% of the vehicles were stuck and moved on by SUMO (teleports)"]
+
+
+def test_a_worker_does_not_import_jax():
+    code = "import sys, uavmec_jax.traffic.worker; assert not {'jax', 'pydantic'} & set(sys.modules), 'heavy'"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
