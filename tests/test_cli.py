@@ -107,6 +107,7 @@ def test_doctor():
     facts = json.loads(uavmec("doctor", "--json").stdout)
     assert facts["environment_steps_per_second"] > 10_000
     assert facts["devices"]
+    assert "libsumo" in facts["versions"]
 
 
 @pytest.mark.parametrize(

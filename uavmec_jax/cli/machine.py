@@ -15,6 +15,7 @@ def doctor(as_json: bool) -> None:
     from uavmec_jax.studies.speed import environment_speed
 
     facts = host.describe() | {"environment_steps_per_second": round(environment_speed(seconds=2.0))}
+    facts["versions"]["libsumo"] = host.version("libsumo")
     if as_json:
         click.echo(json.dumps(facts, indent=1))
         return

@@ -44,7 +44,7 @@ def players(results: Results) -> list[str]:
 
 
 def high_traffic_share(results: Results, policy: str) -> np.ndarray:
-    """``[A]`` share of each agent's first failures that hit a device in high traffic."""
+    """``[A]`` share of each agent's episodes in which a device in high traffic is the first to fail."""
     busy = np.array(
         [results.run["places"][_place(results, row)]["high_traffic"] for _, row in results.agents.iterrows()]
     )
@@ -56,9 +56,9 @@ def traffic_claims(results: Results) -> pd.DataFrame:
 
     Every pair of traffic weights against the same agents without any, seed by seed; per place and policy, and over all
     places (their mean for each seed, since a seed draws the same hardware in each). Columns: ``place``, ``policy``, the
-    axes of the cell, ``share`` and ``share_without`` of the first failures, ``difference`` with ``low`` and ``high`` (95 %),
-    ``fewer``, ``more``, ``same`` seeds, exact ``p_value``, Cohen's ``g``; ``slots`` of lifetime more, ``slots_low``,
-    ``slots_high``. Empty if the study has no agents without traffic in the reward.
+    axes of the cell, ``share`` and ``share_without`` (see :func:`high_traffic_share`), ``difference`` with ``low`` and
+    ``high`` (95 %), ``fewer``, ``more``, ``same`` seeds, exact ``p_value``, Cohen's ``g``; ``slots`` of lifetime more,
+    ``slots_low``, ``slots_high``. Empty if the study has no agents without traffic in the reward.
     """
     study, rows = results.study, []
     agents = results.agents.assign(place=[_place(results, row) for _, row in results.agents.iterrows()])

@@ -56,7 +56,7 @@ def describe() -> dict[str, Any]:
     return {
         "python": sys.version.split()[0],
         "platform": platform.platform(),
-        "versions": {name: _version(name) for name in packages},
+        "versions": {name: version(name) for name in packages},
         "processor": processor(),
         "cores": psutil.cpu_count() or 1,
         "memory_gib": round(psutil.virtual_memory().total / 2**30, 1),
@@ -66,7 +66,8 @@ def describe() -> dict[str, Any]:
     }
 
 
-def _version(name: str) -> str:
+def version(name: str) -> str:
+    """Of an installed package, or that it is not installed."""
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:

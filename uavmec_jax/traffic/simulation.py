@@ -24,8 +24,8 @@ class Densities:
 
     Attributes:
         density: ``[S, W, R]`` vehicles per km and lane, means over a window.
-        loaded, unfinished, teleports: ``[S]`` vehicles that should have driven, had not left by the end, and were moved on
-            by SUMO because they were stuck.
+        loaded, unfinished, teleports: ``[S]`` vehicles that should have driven, had not left by the end (or found no way),
+            and were moved on by SUMO because they were stuck.
     """
 
     density: np.ndarray
@@ -99,6 +99,7 @@ def _prepare(
         "name": name,
         "network": network.file.name,
         "trips": f"{name}.trips.xml",
+        "drivers": trips,
         "seed": seed,
         "begin": demand.warm_up_s,
         "window_s": simulation.window_s,

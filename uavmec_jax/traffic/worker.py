@@ -39,13 +39,13 @@ def simulate(job: dict[str, Any]) -> None:
                 "--no-warnings",
                 "true",
             ),
-            *("--xml-validation", "never", "--duration-log.disable", "true"),
+            *("--xml-validation", "never", "--duration-log.disable", "true", "--ignore-route-errors", "true"),
         ]
     )
     libsumo.simulationStep(end)
     libsumo.close()
     density = _densities(Path(f"{name}.density.xml"), job["roads"], job["windows"])
-    found: dict[str, Any] = {"density": density, **_counts(Path(f"{name}.statistics.xml"))}
+    found: dict[str, Any] = {"density": density, **_counts(Path(f"{name}.statistics.xml"), job["drivers"])}
     np.savez(f"{name}.npz", **found)
 
 
@@ -64,15 +64,15 @@ def _densities(path: Path, roads: list[str], windows: int) -> np.ndarray:
     return density
 
 
-def _counts(path: Path) -> dict[str, int]:
-    """Vehicles that should have driven, had not left by the end, and were moved by SUMO because they were stuck."""
+def _counts(path: Path, drivers: int) -> dict[str, int]:
+    """Drivers, those who had not arrived by the end (or found no way), and those whom SUMO moved because they were stuck."""
     root = ElementTree.parse(path).getroot()
     found = {tag: root.find(tag) for tag in ("vehicles", "teleports")}
     read = {tag: dict(element.attrib) if element is not None else {} for tag, element in found.items()}
     vehicles = {key: int(value) for key, value in read["vehicles"].items()}
     return {
-        "loaded": vehicles.get("loaded", 0),
-        "unfinished": vehicles.get("running", 0) + vehicles.get("waiting", 0),
+        "loaded": drivers,
+        "unfinished": drivers - vehicles.get("inserted", 0) + vehicles.get("running", 0),
         "teleports": int(read["teleports"].get("total", 0)),
     }
 

@@ -79,15 +79,14 @@ class Workshop:
         Raises:
             TrafficError: it failed (its last line of error), or took too long.
         """
-        process = self._start(command, env)
-        try:
-            out, said = process.communicate(timeout=limit_s)
-        except subprocess.TimeoutExpired:
-            raise TrafficError(f"{name}: did not end within its limit of {limit_s:g} s and was stopped") from None
-        finally:
-            process.kill()
-            process.communicate()
-            self._tell("-", process)
+        with self._start(command, env) as process:
+            try:
+                out, said = process.communicate(timeout=limit_s)
+            except subprocess.TimeoutExpired:
+                raise TrafficError(f"{name}: did not end within its limit of {limit_s:g} s and was stopped") from None
+            finally:
+                process.kill()
+                self._tell("-", process)
         if process.returncode != 0:
             raise TrafficError(f"{name}: {last_error(said + out) or f'ended with exit code {process.returncode}'}")
         return out
