@@ -49,6 +49,7 @@ def test_actions_are_drawn_from_the_softmax():
     assert_array_equal(edges, [0, 3])
 
 
+@pytest.mark.slow
 def test_a_rollout_plays_the_environment():
     spec = a2c.A2CSpec(n_steps=40, n_envs=3)
     agent = make_agent(0, kind=a2c.A2CHyper)

@@ -103,6 +103,7 @@ def test_blocks_padding_and_devices_do_not_change_an_agent():
         jax.tree.map(lambda a, b: assert_allclose(a, b, rtol=1e-2, atol=1e-3), whole.last, other)
 
 
+@pytest.mark.slow
 def test_small_replay_wraps():
     agents = stack([make_agent(0), make_agent(1)])
     (block,), _ = train(agents, replay_capacity=100)

@@ -36,7 +36,8 @@ def test_shipped_studies_are_valid_and_round_trip(name):
     study = load_study(name)
     assert study.name == name
     assert parse_study(study_toml(study), "again") == study
-    assert n_agents(study) == len(identities(study)) == {"planning": 2500, "table6": 675}.get(name, 250)
+    sizes = {"planning": 2500, "table6": 675, "table7": 240, "table7-ppo": 120}
+    assert n_agents(study) == len(identities(study)) == sizes.get(name, 250)
 
 
 def test_table5_is_the_paper():

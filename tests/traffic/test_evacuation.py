@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from tests.traffic.towns import evacuation
-from uavmec_jax.errors import TrafficError
+from uavmec_jax.errors import PolicyError, TrafficError
 from uavmec_jax.files import read_checked, write_checked
 from uavmec_jax.studies.policies import load_policy
 from uavmec_jax.traffic.evacuation import HIGH_TRAFFIC, load_evacuation
@@ -119,7 +119,9 @@ def test_an_altered_weight_is_noticed(tmp_path):
 
 def test_a_policy_is_no_evacuation(tmp_path):
     write_checked(tmp_path / "x.npz", 1, {"meta": {}}, {})
-    with pytest.raises(ValueError, match=r"x\.npz"):
+    with pytest.raises(
+        PolicyError, match=r"x\.npz: is not a file of policies: its header has no agents, n_devices, set"
+    ):
         load_policy(tmp_path / "x.npz")
     facts, arrays = read_checked(tmp_path / "x.npz", 1, "anything", TrafficError)
     assert facts["meta"] == {}

@@ -153,5 +153,7 @@ def evaluate(
 def _town(scenario: Path | None, powered: int | None, connected: int | None, place: str | None) -> dict[str, Any]:
     """How many devices of a random town have what; refuses counts and places beside a layout file."""
     if scenario is not None and (powered, connected, place) != (None, None, None):
-        fail(f"{scenario}: says itself what its devices have; leave out --powered, --connected and --place")
+        fail(
+            f"{scenario}: says itself who has power and communication, and where; leave out --powered, --connected, --place"
+        )
     return {"powered": 8 if powered is None else powered, "connected": 8 if connected is None else connected}

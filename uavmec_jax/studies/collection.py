@@ -103,6 +103,8 @@ def read_collection(path: Path) -> Collection:
         PolicyError: the file is not there, is damaged, was altered, is something else or from a newer version.
     """
     facts, weights = read_checked(path, SCHEMA, "a file of policies", PolicyError)
+    if missing := {"settings", "n_devices", "agents"} - set(facts):
+        raise PolicyError(f"{path}: is not a file of policies: its header has no {', '.join(sorted(missing))}")
     found = Collection(facts["settings"], facts["n_devices"], facts["agents"], weights)
     _check_shapes(path, found)
     return found
