@@ -59,6 +59,7 @@ def test_target_is_due_at_multiples_of_the_interval():
     assert [steps for steps in range(4, 33, 4) if dqn.target_is_due(spec, odd, steps)] == [12, 20, 32]
 
 
+@pytest.mark.slow
 def test_first_gradient_step_falls_at_step_104():
     agents = stack([make_agent(0)])
     before = train(SPEC, agents, 0, 25)  # 100 steps

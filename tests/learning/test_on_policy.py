@@ -86,6 +86,7 @@ def test_a_cut_off_episode_is_bootstrapped():
     assert_allclose(difference, 0.5 * (whole.returns[1] - reward_and_value[1]), rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BOTH)
 def test_an_agent_is_itself_whoever_trains_beside_it(name):
     agents = population(name, {}, {"gamma": 0.9}, {"learning_rate": 1e-3})

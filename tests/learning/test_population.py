@@ -60,6 +60,7 @@ def test_too_little_memory_is_said():
         plan_blocks(10, 5 * GIB, 4 * GIB)
 
 
+@pytest.mark.slow
 def test_what_a_block_leaves():
     agents = stack([make_agent(i) for i in range(3)])
     (block,), news = train(agents)

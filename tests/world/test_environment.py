@@ -143,6 +143,7 @@ states = st.fixed_dictionaries(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(states)
 def test_invariants_of_random_play(case):
