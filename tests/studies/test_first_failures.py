@@ -11,7 +11,13 @@ from scipy import stats
 
 from uavmec_jax.reporting import canvas, figures
 from uavmec_jax.reporting.tables import tables
-from uavmec_jax.studies.first_failures import first_failure_counts, high_traffic_share, traffic_claims
+from uavmec_jax.studies.first_failures import (
+    first_failure_counts,
+    first_failure_groups,
+    high_traffic_share,
+    place_frames,
+    traffic_claims,
+)
 from uavmec_jax.studies.paper import TABLE7
 from uavmec_jax.studies.places import describe_places
 from uavmec_jax.studies.results import Results
@@ -94,6 +100,30 @@ def test_tables_like_the_papers(results):
     assert [word.strip() for word in high.strip("│").split("│")] == [
         "high", "", "10.0", "10.0", "1.0", "1.0", "10.0", "10.0", "0"
     ]  # fmt: skip
+
+
+def test_cells_of_a_place_have_tables_of_their_own(results):
+    both = pd.concat([results.agents, results.agents.assign(powered=6)], ignore_index=True)
+    study = load_study("table7", {"axes.seeds": 10, "axes.cells": [[8, 6], [6, 6]]})
+    evaluation = {name: np.concatenate([leaf, leaf]) for name, leaf in results.evaluation.items()}
+    twice = Results(study=study, run=results.run, agents=both, curves={"dqn": {}}, evaluation=evaluation)
+    assert list(first_failure_groups(twice)) == [
+        "round_lake, powered 8", "albany, powered 8", "round_lake, powered 6", "albany, powered 6"
+    ]  # fmt: skip
+    assert len(tables(twice)) == 1 + 4 + 1
+    assert figures.run_figure(twice)
+    told = place_frames(twice)
+    assert len(told["claims"]) == 2 * len(traffic_claims(results))
+    assert place_frames(Results(study=study, run={})) == {}
+
+
+def test_a_study_of_places_that_trains_nothing(results):
+    study = load_study("table7", {"axes.seeds": 10, "algorithm": "none", "axes.traffic_penalty": [0.0]})
+    idle = results.agents.drop(columns=[name for name in results.agents if name.startswith(("best", "last"))])
+    evaluation = {name: leaf for name, leaf in results.evaluation.items() if name[:4] not in ("best", "last")}
+    nothing = Results(study=study, run=results.run, agents=idle, evaluation=evaluation)
+    assert len(tables(nothing)) == 3
+    assert figures.run_figure(nothing)
 
 
 def test_the_papers_counts():

@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from tests.traffic.towns import evacuation
 from uavmec_jax.errors import StudyError, TrafficError
 from uavmec_jax.reporting.tables import tables
+from uavmec_jax.studies.policies import load_policy
 from uavmec_jax.studies.results import load_results
 from uavmec_jax.studies.run import plan_study, run_study
 from uavmec_jax.studies.scenario import load_scenario
@@ -133,6 +134,13 @@ def test_a_run_from_end_to_end(tmp_path):
     titles = list(tables(again))
     assert [title.split(":")[0] for title in titles[1:3]] == ["round_lake", "albany"]
     assert titles[3].startswith("First failures on devices in high traffic")
+    trained = load_policy(tmp_path / "run", place="albany", seed=1, traffic_bonus=3.0)
+    assert trained.trained_on["place"] == "albany"
+    fixed = run_study(
+        parse_study(TOML, "x", {"place": "albany", "axes": {"cells": [[8, 6]], "seeds": 1}}), tmp_path / "fixed"
+    )
+    assert len(fixed.agents) == 1
+    assert load_policy(tmp_path / "fixed", place="albany").trained_on["place"] == "albany"
     # Who learns nothing plays the same whatever a learner is paid for.
     oldest = results.agents.pivot_table(
         index=["seed", "place"], columns="traffic_bonus", values="oldest_first_lifetime"

@@ -26,10 +26,13 @@ def assignment(text: str, option: str = "--set") -> tuple[str, Any]:
 def print_results(results: Any, directory: Path, console: Any, as_json: bool) -> None:
     """The tables of a run, or its cells as JSON."""
     from uavmec_jax.reporting.tables import summary, tables
+    from uavmec_jax.studies.first_failures import place_frames
 
     if as_json:
-        cells = json.loads(results.cells().to_json(orient="records"))
-        click.echo(json.dumps({"directory": str(directory), "run": results.run, "cells": cells}, indent=1))
+        told = {"directory": str(directory), "run": results.run}
+        for name, table in {"cells": results.cells(), **place_frames(results)}.items():
+            told[name] = json.loads(table.to_json(orient="records"))
+        click.echo(json.dumps(told, indent=1))
         return
     print_tables(console, tables(results), summary(results), directory)
 

@@ -109,8 +109,9 @@ def evaluate(
     from uavmec_jax.studies.scenario import load_scenario
 
     axes = dict(assignment(setting, "--agent") for setting in agent)
+    here = town | {"seed": seed} | ({"place": place} if place else {})
     if Path(policy).is_dir() and scenario is None:
-        axes = town | {"seed": seed} | axes
+        axes = here | axes
     chosen = load_policy(policy, weights, **axes)
     inventory, keys = load_scenario(
         scenario,
@@ -130,9 +131,7 @@ def evaluate(
         learned = {"algorithm": trained.algorithm, "trained_on": dict(trained.trained_on)} if trained else {}
         click.echo(
             json.dumps(
-                {"command": command_line(), "scenario": str(scenario or town | {"seed": seed})}
-                | learned
-                | {"policies": rows},
+                {"command": command_line(), "scenario": str(scenario or here)} | learned | {"policies": rows},
                 indent=1,
             )
         )
@@ -143,8 +142,7 @@ def evaluate(
     if trained is not None:
         known = ", ".join(f"{name} {value}" for name, value in trained.trained_on.items())
         console.print(f"Trained by {trained.algorithm.upper()} on {known}.", highlight=False)
-        here = town | {"seed": seed}
-        if scenario is not None or any(trained.trained_on.get(name) != value for name, value in here.items()):
+        if scenario is not None or any(trained.trained_on.get(name) != here.get(name) for name in (*here, "place")):
             console.print(
                 "This is another town: its observation names no places, so nothing it learned need hold here."
             )

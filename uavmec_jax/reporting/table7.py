@@ -7,7 +7,7 @@ from rich.table import Table
 from rich.text import Text
 
 from uavmec_jax.reporting.words import half_interval, place
-from uavmec_jax.studies.first_failures import LEARNED, first_failure_counts, traffic_claims
+from uavmec_jax.studies.first_failures import LEARNED, first_failure_groups, traffic_claims
 from uavmec_jax.studies.paper import TABLE7
 from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.schema import PLANNERS, TRAFFIC_WEIGHTS
@@ -32,14 +32,11 @@ def traffic_words(cell: Any) -> str:
 
 def table7_tables(results: Results) -> dict[str, Table]:
     """First failures of each place's devices, lifetimes, and the test of the paper's claim."""
-    counts = first_failure_counts(results)
-    seeds = int(counts["seeds"].max())
-    shown = {"Lifetime in slots, mean over the seeds ± 95 %": lifetimes_table(results)} | {
-        f"{town}: first failures of each device in {seeds} scenarios; best weights by what traffic weighs in their reward": (
-            counts_table(counts[counts["place"] == town])
-        )
-        for town in dict.fromkeys(counts["place"])
-    }
+    shown = {"Lifetime in slots, mean over the seeds ± 95 %": lifetimes_table(results)}
+    for name, counts in first_failure_groups(results).items():
+        seeds = int(counts["seeds"].max())
+        how = f"first failures of each device in {seeds} scenarios; best weights by what traffic weighs in their reward"
+        shown[f"{name}: {how}"] = counts_table(counts)
     claims = traffic_claims(results)
     if len(claims):
         shown["First failures on devices in high traffic, with traffic in the reward against without, seed by seed"] = (

@@ -38,6 +38,25 @@ def first_failure_counts(results: Results) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def first_failure_groups(results: Results) -> dict[str, pd.DataFrame]:
+    """The counts cut into parts that differ in what traffic weighs alone, by name: the place, and what else varies."""
+    counts = first_failure_counts(results)
+    axes = ["place", *(axis for axis in cell_axes(results.study) if axis not in ("place", *TRAFFIC_WEIGHTS))]
+    varies = [axis for axis in axes[1:] if counts[axis].nunique() > 1]
+    groups = {}
+    for values, group in counts.groupby(axes, sort=False):
+        cell = dict(zip(axes, values, strict=True))
+        groups[", ".join([str(cell["place"]), *(f"{axis} {cell[axis]}" for axis in varies)])] = group
+    return groups
+
+
+def place_frames(results: Results) -> dict[str, pd.DataFrame]:
+    """What a study of places has beside its cells: ``first_failures`` and ``claims``; nothing of other studies."""
+    if not has_places(results):
+        return {}
+    return {"first_failures": first_failure_counts(results), "claims": traffic_claims(results)}
+
+
 def players(results: Results) -> list[str]:
     """Policies and planners whose first failures are known."""
     return [*results.policies, *(name for name in PLANNERS if f"{name}/first_failure" in results.evaluation)]

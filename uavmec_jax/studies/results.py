@@ -132,6 +132,7 @@ class Results:
         axes = ["seed", *cell_axes(self.study)]
         agents: dict[str, list[dict[str, Any]]] = {}
         for row in json.loads(self.agents[axes].to_json(orient="records", double_precision=15)):
+            row |= {"place": self.study.place} if self.study.place else {}
             agents.setdefault(row.get("algorithm", self.study.algorithm), []).append(row)
         return Collection(
             settings={name: getattr(self.study, name).model_dump(mode="json") for name in self.study.algorithms},
