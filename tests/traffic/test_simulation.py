@@ -199,7 +199,16 @@ def test_the_command_from_end_to_end(town, tmp_path):
     settings = [f"{table}.{name}={value}" for table, own in SMALL.items() for name, value in own.items()]
     options = [word for setting in settings for word in ("--set", setting)]
     out = tmp_path / "town.npz"
-    command = ["traffic", "build", "--osm", str(town / "town.osm.gz"), "--bbox", "9.6,49.9,9.8,50.1", *options]
+    (tmp_path / "Städtchen (1).osm.gz").write_bytes((town / "town.osm.gz").read_bytes())
+    command = [
+        "traffic",
+        "build",
+        "--osm",
+        str(tmp_path / "Städtchen (1).osm.gz"),
+        "--bbox",
+        "9.6,49.9,9.8,50.1",
+        *options,
+    ]
     done = CliRunner().invoke(main, [*command, "--seeds", "1", "--out", str(out)])
     assert done.exit_code == 0, done.output
     assert "vehicles in all (150 evacuated in each)" in done.stdout
@@ -213,6 +222,7 @@ def test_the_command_from_end_to_end(town, tmp_path):
     )
     assert done.exit_code == 0, done.output
     assert load_evacuation(out).meta["names"] == ["a", "b"]
+    assert load_evacuation(out).name == "St-dtchen-1"
     assert load_evacuation(out).region_m() == (200, 50)
     assert told["meta"]["settings"]["network"]["bbox"] == [9.6, 49.9, 9.8, 50.1]
 

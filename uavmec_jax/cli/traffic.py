@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -62,36 +63,17 @@ def build(
     from rich.console import Console
 
     from uavmec_jax.traffic.build import build_evacuation
-    from uavmec_jax.traffic.place import load_place, make_place, read_toml
+    from uavmec_jax.traffic.place import load_place, make_place
 
-    changes: dict[str, Any] = {"demand": {}, "simulation": {}}
-    if origins:
-        changes["demand"]["origins"] = origins
-    if exits:
-        changes["demand"]["exits"] = dict(_exit(one) for one in exits)
-    if vehicles is not None:
-        changes["demand"]["vehicles"] = vehicles
-    if seeds is not None:
-        changes["simulation"]["seeds"] = seeds
-    for dotted, value in map(assignment, settings):
-        table, _, name = dotted.partition(".")
-        if not name:
-            fail(f"--set {dotted}: name a table and a setting, e.g. demand.vehicles=2000")
-        changes.setdefault(table, {})[name] = value
-    if devices is not None:
-        changes["device"] = read_toml(devices).get("device", [])
-        if not changes["device"]:
-            fail(f"{devices}: holds no [[device]] tables")
+    changes = _changes(settings, devices, origins=origins, exits=exits, vehicles=vehicles, seeds=seeds)
     if place is not None:
         resolved, folder = load_place(place, changes)
     else:
         source = osm or net
         assert source is not None
-        found: dict[str, Any] = {"osm" if osm else "net": str(source.absolute())}
-        if bbox is not None:
-            found["bbox"] = _box(bbox)
-        name = source.name.split(".")[0] or "town"
-        resolved, folder = make_place({"name": name, "network": found} | changes, str(source)), Path()
+        network = {"osm" if osm else "net": str(source.absolute())} | ({"bbox": _box(bbox)} if bbox else {})
+        name = re.sub("[^A-Za-z0-9]+", "-", source.name.split(".")[0]).strip("-") or "town"
+        resolved, folder = make_place({"name": name, "network": network} | changes, str(source)), Path()
     target = _target(out or Path(f"{resolved.name}.npz"))
     console = Console(stderr=True)
     with console.status("starting") as status:
@@ -163,6 +145,35 @@ def _print(evacuation: Any, source: str, as_json: bool) -> None:
     for line in evacuation_lines(evacuation):
         console.print(line, highlight=False)
     console.print(f"File: {source}", highlight=False, soft_wrap=True)
+
+
+def _changes(
+    settings: tuple[str, ...],
+    devices: Path | None,
+    *,
+    origins: tuple[str, ...],
+    exits: tuple[str, ...],
+    vehicles: int | None,
+    seeds: int | None,
+) -> dict[str, Any]:
+    """What the options change about a place, as tables of its file."""
+    from uavmec_jax.traffic.place import read_toml
+
+    demand = {"origins": origins or None, "exits": dict(map(_exit, exits)) or None, "vehicles": vehicles}
+    given: dict[str, dict[str, Any]] = {"demand": demand, "simulation": {"seeds": seeds}}
+    changes: dict[str, Any] = {
+        table: {name: value for name, value in own.items() if value is not None} for table, own in given.items()
+    }
+    for dotted, value in map(assignment, settings):
+        table, _, name = dotted.partition(".")
+        if not name:
+            fail(f"--set {dotted}: name a table and a setting, e.g. demand.vehicles=2000")
+        changes.setdefault(table, {})[name] = value
+    if devices is not None:
+        changes["device"] = read_toml(devices).get("device", [])
+        if not changes["device"]:
+            fail(f"{devices}: holds no [[device]] tables")
+    return changes
 
 
 def _exit(text: str) -> tuple[str, Any]:
