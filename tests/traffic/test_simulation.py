@@ -149,6 +149,14 @@ def test_bad_places_are_one_line(town, change, line):
     assert "\n" not in str(caught.value)
 
 
+def test_devices_are_refused_before_anything_is_simulated(town, monkeypatch):
+    monkeypatch.setattr("uavmec_jax.traffic.build.simulate", lambda *_: pytest.fail("it was simulated"))
+    sites = [{"name": "a", "junction": "nowhere"}, {"name": "b", "junction": "nowhere"}]
+    for change, line in (({"device": sites}, "junction is 'nowhere'"), ({"devices": {"count": 60}}, "60 devices, but")):
+        with pytest.raises(TrafficError, match=line):
+            built(town, **change)
+
+
 @pytest.mark.parametrize(
     ("text", "line"),
     [

@@ -7,7 +7,7 @@ import numpy as np
 
 from uavmec_jax.traffic import sumo
 from uavmec_jax.traffic.demand import find_routes
-from uavmec_jax.traffic.devices import place_devices
+from uavmec_jax.traffic.devices import check_devices, place_devices
 from uavmec_jax.traffic.evacuation import Evacuation
 from uavmec_jax.traffic.network import build_network
 from uavmec_jax.traffic.place import Place
@@ -34,6 +34,7 @@ def build_evacuation(
         network = build_network(place.network, folder, workshop)
         on_progress(f"network: {len(network.roads):,} roads, {len(network.junctions):,} junctions")
         routes = find_routes(network, place.demand, place.name)
+        check_devices(place, network, routes)
         on_progress(
             f"demand: {len(routes.origins):,} origins, {len(routes.exits)} exits, {place.demand.vehicles:,} vehicles"
         )

@@ -24,12 +24,24 @@ def place_devices(
         density: ``[R]`` vehicles per km and lane, which say what a corridor is.
 
     Raises:
-        TrafficError: a junction does not exist, or there are fewer of them than devices.
+        TrafficError: see :func:`check_devices`.
     """
     if place.device:
         return [site.name for site in place.device], np.array([_of(site, network, place.name) for site in place.device])
-    chosen = _chosen(place.name, place.devices, network, _middle(routes), density)
+    chosen = _chosen(place.devices, network, _inside(place, network, routes), density)
     return _named(chosen, network), np.array([network.junctions[junction] for junction in chosen])
+
+
+def check_devices(place: Place, network: RoadNetwork, routes: Routes) -> None:
+    """Refuse before anything is simulated what :func:`place_devices` could not do.
+
+    Raises:
+        TrafficError: a junction does not exist, or there are fewer of them than devices.
+    """
+    if not place.device:
+        _inside(place, network, routes)
+    for site in place.device:
+        _of(site, network, place.name)
 
 
 def _named(junctions: list[str], network: RoadNetwork) -> list[str]:
@@ -50,23 +62,22 @@ def _of(site: Site, network: RoadNetwork, name: str) -> tuple[float, float]:
     return network.junctions[site.junction]
 
 
-def _middle(routes: Routes) -> np.ndarray:
-    """Where people live, on average."""
-    middles = np.array([road.shape.mean(axis=0) for road in routes.origins])
-    return np.asarray(routes.origin_share @ middles)
-
-
-def _chosen(
-    name: str, placement: Placement, network: RoadNetwork, middle: np.ndarray, density: np.ndarray
-) -> list[str]:
-    ids = list(network.junctions)
-    position = np.array([network.junctions[junction] for junction in ids])
-    inside = np.flatnonzero(np.abs(position - middle).max(axis=1) <= placement.span_m / 2)
-    if len(inside) < placement.count:
+def _inside(place: Place, network: RoadNetwork, routes: Routes) -> np.ndarray:
+    """Junctions, by their place in the network, within ``span_m`` around where people live on average."""
+    middle = routes.origin_share @ np.array([road.shape.mean(axis=0) for road in routes.origins])
+    position = np.array(list(network.junctions.values()))
+    count, span = place.devices.count, place.devices.span_m
+    inside = np.flatnonzero(np.abs(position - middle).max(axis=1) <= span / 2)
+    if len(inside) < count:
         raise TrafficError(
-            f"{name}: {placement.count} devices, but {len(inside)} junctions in the {placement.span_m:g} m around where "
-            f"people live ({len(ids)} in all); give fewer devices.count or a larger devices.span_m"
+            f"{place.name}: {count} devices, but {len(inside)} junctions in the {span:g} m around where people live "
+            f"({len(position)} in all); give fewer devices.count or a larger devices.span_m"
         )
+    return inside
+
+
+def _chosen(placement: Placement, network: RoadNetwork, inside: np.ndarray, density: np.ndarray) -> list[str]:
+    ids, position = list(network.junctions), np.array(list(network.junctions.values()))
     roads = list(network.roads.values())
     near = density_near(
         position[inside],
