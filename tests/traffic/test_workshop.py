@@ -44,6 +44,15 @@ def test_failures_tell_the_last_error():
     assert last_error("") == ""
 
 
+def test_it_works_on_without_its_guardian():
+    with Workshop() as workshop:
+        workshop._guardian.kill()
+        workshop._guardian.wait()
+        assert workshop.run("p", python("print(1)"), limit_s=20) == "1\n"
+        folder = workshop.folder
+    assert not folder.exists()
+
+
 def test_after_a_stop_nothing_is_started():
     with Workshop() as workshop:
         workshop.stop()

@@ -10,7 +10,7 @@ from uavmec_jax.reporting.canvas import new_figure
 from uavmec_jax.traffic.evacuation import Evacuation
 
 COLOURS = ("blue", "cyan", "yellow", "green", "orange", "red", "magenta")
-"""In order of increasing density (paper, figures 6 and 7)."""
+"""In order of increasing density (paper, figure 4)."""
 
 LIMITS = (2.0, 5.0, 10.0, 20.0, 35.0, 60.0)
 """Vehicles per km and lane between one colour and the next; the paper gives none."""

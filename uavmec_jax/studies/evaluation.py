@@ -214,9 +214,7 @@ def judge_all(
     learned: dict[str, Judgement],
     distinct: Distinct,
     settings: Evaluation,
-    seconds: dict[str, float],
-    started: float,
-) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+) -> tuple[dict[str, Any], dict[str, np.ndarray], float]:
     """Judge heuristics and planners beside the learned policies.
 
     Args:
@@ -225,23 +223,20 @@ def judge_all(
         learned: from :func:`judge_learned`.
         distinct: which agents play the same.
         settings: who plays.
-        seconds: ``evaluate`` and ``plan`` grow by what was spent, the former since ``started``.
-        started: of :func:`time.perf_counter`.
 
     Returns:
-        Columns of the tidy table, and every episode by ``policy/field``.
+        Columns of the tidy table, every episode by ``policy/field``, and the seconds that the planners took.
     """
     once, draws = jax.tree.map(lambda leaf: leaf[distinct.first], (agents, keys))
     heuristics = judge_heuristics(once, draws, settings.baselines)
-    tock = time.perf_counter()
     reached = [distinct.longest(judged.lifetime) for judged in learned.values()]
     reached += [judged.lifetime for judged in heuristics.values()]
+    started = time.perf_counter()
     planned = {
         name: distinct.to_agents(judged)
         for name, judged in judge_planners(once, draws[:, :-1], settings, reached).items()
     }
-    seconds["evaluate"] += tock - started
-    seconds["plan"] += time.perf_counter() - tock
+    planning = time.perf_counter() - started
     judgements = learned | {name: distinct.to_agents(judged) for name, judged in heuristics.items()}
     columns = {name: values for policy, judged in judgements.items() for name, values in judged.columns(policy).items()}
     everyone: dict[str, Judgement | PlannedJudgement] = {**judgements, **planned}
@@ -251,7 +246,7 @@ def judge_all(
         for name, values in asdict(anyone).items()
         if values is not None
     }
-    return columns | planned_columns(judgements, planned), evaluation
+    return columns | planned_columns(judgements, planned), evaluation, planning
 
 
 # Jitted here and not inside `judge`, so that the blocks of a run share one compilation.

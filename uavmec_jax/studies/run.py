@@ -241,7 +241,9 @@ class _Population:
                 best_validation=trained.best_score,
             )
             learned = judge_learned(self.algorithm, members, keys, weights)
-        columns, evaluation = judge_all(members, keys, learned, distinct, self.study.evaluation, seconds, tick)
+        columns, evaluation, planning = judge_all(members, keys, learned, distinct, self.study.evaluation)
+        seconds["plan"] += planning
+        seconds["evaluate"] += time.perf_counter() - tick - planning
         results.add(self.study.algorithm, rows.assign(**columns), curves, evaluation, weights)
 
 

@@ -1,5 +1,6 @@
 """A temporary folder and the processes that work in it; none of them outlives us, however we end."""
 
+import contextlib
 import os
 import shutil
 import subprocess
@@ -43,6 +44,8 @@ class Workshop:
         self._guardian = subprocess.Popen(
             [sys.executable, "-S", "-E", "-c", _GUARDIAN, str(self.folder)],
             stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,  # who reads what we print does not wait for it
+            stderr=subprocess.DEVNULL,
             text=True,
             start_new_session=True,  # Ctrl-C ends the commands of the terminal, not this one
         )
@@ -53,7 +56,8 @@ class Workshop:
     ) -> None:
         self.stop()
         assert self._guardian.stdin is not None
-        self._guardian.stdin.close()
+        with contextlib.suppress(OSError):
+            self._guardian.stdin.close()
         self._guardian.wait()
         shutil.rmtree(self.folder, ignore_errors=True)
 
@@ -114,8 +118,9 @@ class Workshop:
             if sign == "-":
                 self._running.discard(process)
             assert self._guardian.stdin is not None
-            self._guardian.stdin.write(f"{sign}{process.pid}\n")
-            self._guardian.stdin.flush()
+            with contextlib.suppress(OSError):  # somebody has killed it: then only we clean up
+                self._guardian.stdin.write(f"{sign}{process.pid}\n")
+                self._guardian.stdin.flush()
 
 
 def last_error(said: str) -> str:

@@ -73,7 +73,7 @@ class Reward:
         log1p: bool; the guard of the logarithms, see :data:`LOG_GUARDS`.
         function: ``None``, or what makes a scalar from ``{term: scalar}`` in place of the weights; static.
         traffic_bonus: added once for a device in the densest traffic when it is visited, less for others, in proportion
-            to their traffic (paper, section 4.5).
+            to their traffic (paper, section 5.1).
         traffic_penalty: taken off, in the same proportion, for the device that fails first.
     """
 
