@@ -126,6 +126,26 @@ def test_a_study_of_places_that_trains_nothing(results):
     assert figures.run_figure(nothing)
 
 
+def test_what_traffic_weighs_is_named_where_it_is_no_axis(results):
+    fined = (
+        (results.agents.traffic_penalty > 0) & (results.agents.traffic_bonus == 0) & (results.agents.place == "albany")
+    )
+    study = load_study(
+        "table7", {"place": "albany", "traffic_penalty": 300.0, "axes": {"cells": [[8, 6]], "seeds": 10}}
+    )
+    agents = results.agents[fined].drop(columns=["place", "traffic_penalty", "traffic_bonus"]).reset_index(drop=True)
+    evaluation = {name: leaf[fined.to_numpy()] for name, leaf in results.evaluation.items()}
+    alone = Results(study=study, run=results.run, agents=agents, evaluation=evaluation)
+    assert set(first_failure_counts(alone)["traffic_penalty"]) == {300.0}
+    console = Console(width=160, record=True, file=io.StringIO())
+    for title, table in tables(alone).items():
+        assert title.startswith(("Lifetime", "albany: first failures"))
+        console.print(table)
+    text = console.export_text()
+    assert text.count("failure 300") == 2
+    assert "none" not in text
+
+
 def test_the_papers_counts():
     assert {name: sum(counts) for name, counts in TABLE7.items()} == {"round_lake": 30, "albany": 30}
 

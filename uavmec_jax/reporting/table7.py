@@ -7,7 +7,7 @@ from rich.table import Table
 from rich.text import Text
 
 from uavmec_jax.reporting.words import half_interval, place
-from uavmec_jax.studies.first_failures import LEARNED, first_failure_groups, traffic_claims
+from uavmec_jax.studies.first_failures import LEARNED, first_failure_groups, traffic_claims, with_traffic
 from uavmec_jax.studies.paper import TABLE7
 from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.schema import PLANNERS, TRAFFIC_WEIGHTS
@@ -25,7 +25,7 @@ _SIGNIFICANT = 0.05
 
 def traffic_words(cell: Any) -> str:
     """What traffic weighs in the reward of a cell: ``none``, ``visit 10`` (the paper's bonus), ``failure 100``, or both."""
-    bonus, penalty = (float(cell.get(name, 0.0)) for name in TRAFFIC_WEIGHTS)
+    bonus, penalty = (float(cell[name]) for name in TRAFFIC_WEIGHTS)
     words = [f"visit {bonus:g}"] * (bonus > 0) + [f"failure {penalty:g}"] * (penalty > 0)
     return " + ".join(words) or "none"
 
@@ -47,7 +47,7 @@ def table7_tables(results: Results) -> dict[str, Table]:
 
 def lifetimes_table(results: Results) -> Table:
     """A line per cell: learned policies with their intervals, heuristics, planners."""
-    cells, table = results.cells(), Table()
+    cells, table = with_traffic(results.cells(), results.study), Table()
     axes = [axis for axis in cell_axes(results.study) if axis not in TRAFFIC_WEIGHTS]
     axes = [axis for axis in axes if cells[axis].nunique() > 1 or axis in ("powered", "connected")]
     learned = [name for name in LEARNED if name in cells]

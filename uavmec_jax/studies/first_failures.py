@@ -1,13 +1,12 @@
 """Who fails first in an evacuation, and whether the reward keeps it from being a device in high traffic (Table 7)."""
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from uavmec_jax.studies.results import Results
-from uavmec_jax.studies.schema import PLANNERS, TRAFFIC_WEIGHTS
+from uavmec_jax.studies.schema import PLANNERS, TRAFFIC_WEIGHTS, Study
 from uavmec_jax.studies.statistics import mean_interval, sign_test
 from uavmec_jax.studies.study import cell_axes
 
@@ -20,6 +19,12 @@ def has_places(results: Results) -> bool:
     return bool(results.run.get("places"))
 
 
+def with_traffic(table: pd.DataFrame, study: Study) -> pd.DataFrame:
+    """Agents or cells of a study with their place and what traffic weighs for them, also where these are no axes."""
+    fixed = {name: getattr(study, name) for name in ("place", *TRAFFIC_WEIGHTS) if name not in table}
+    return table.assign(**fixed)
+
+
 def first_failure_counts(results: Results) -> pd.DataFrame:
     """How many of its scenarios each device is the first to fail in: one row per cell, policy and device.
 
@@ -28,10 +33,13 @@ def first_failure_counts(results: Results) -> pd.DataFrame:
     ``device`` (from 1), ``name``, ``weight``, ``high_traffic``, ``count``, ``seeds``.
     """
     rows = []
-    for cell, group in _cells(results):
+    agents = with_traffic(results.agents, results.study)
+    axes = [*_other_axes(results.study), "place", *TRAFFIC_WEIGHTS]
+    for values, group in agents.groupby(axes, sort=False):
+        cell = dict(zip(axes, values, strict=True))
         place = results.run["places"][cell["place"]]
         for policy in players(results):
-            counts = _first_failures(results, policy)[group.index].sum(axis=0)
+            counts = results.first_failures(policy)[group.index].sum(axis=0)
             for k, count in enumerate(counts):
                 named = {name: place[name][k] for name in ("name", "weight", "high_traffic")}
                 rows.append(cell | {"policy": policy, "device": k + 1} | named | {"count": count, "seeds": len(group)})
@@ -41,11 +49,11 @@ def first_failure_counts(results: Results) -> pd.DataFrame:
 def first_failure_groups(results: Results) -> dict[str, pd.DataFrame]:
     """The counts cut into parts that differ in what traffic weighs alone, by name: the place, and what else varies."""
     counts = first_failure_counts(results)
-    axes = ["place", *(axis for axis in cell_axes(results.study) if axis not in ("place", *TRAFFIC_WEIGHTS))]
-    varies = [axis for axis in axes[1:] if counts[axis].nunique() > 1]
+    axes = _other_axes(results.study)
+    varies = [axis for axis in axes if counts[axis].nunique() > 1]
     groups = {}
-    for values, group in counts.groupby(axes, sort=False):
-        cell = dict(zip(axes, values, strict=True))
+    for values, group in counts.groupby([*axes, "place"], sort=False):
+        cell = dict(zip([*axes, "place"], values, strict=True))
         groups[", ".join([str(cell["place"]), *(f"{axis} {cell[axis]}" for axis in varies)])] = group
     return groups
 
@@ -64,10 +72,9 @@ def players(results: Results) -> list[str]:
 
 def high_traffic_share(results: Results, policy: str) -> np.ndarray:
     """``[A]`` share of each agent's episodes in which a device in high traffic is the first to fail."""
-    busy = np.array(
-        [results.run["places"][_place(results, row)]["high_traffic"] for _, row in results.agents.iterrows()]
-    )
-    return np.asarray((_first_failures(results, policy) * busy).sum(axis=1))
+    places = with_traffic(results.agents, results.study)["place"]
+    busy = np.array([results.run["places"][place]["high_traffic"] for place in places])
+    return np.asarray((results.first_failures(policy) * busy).sum(axis=1))
 
 
 def traffic_claims(results: Results) -> pd.DataFrame:
@@ -80,21 +87,17 @@ def traffic_claims(results: Results) -> pd.DataFrame:
     ``slots_low``, ``slots_high``. Empty if the study has no agents without traffic in the reward.
     """
     study, rows = results.study, []
-    agents = results.agents.assign(place=[_place(results, row) for _, row in results.agents.iterrows()])
-    for name in TRAFFIC_WEIGHTS:
-        if name not in agents:
-            agents[name] = getattr(study, name)
-    others = [axis for axis in cell_axes(study) if axis not in ("place", *TRAFFIC_WEIGHTS)]
+    agents, others = with_traffic(results.agents, study), _other_axes(study)
     for policy in (name for name in LEARNED if name in results.policies):
         table = agents.assign(share=high_traffic_share(results, policy), slots=agents[f"{policy}_lifetime"])
         table = table[["seed", *others, "place", *TRAFFIC_WEIGHTS, "share", "slots"]]
         everywhere = (
             table.groupby(["seed", *others, *TRAFFIC_WEIGHTS], sort=False)[["share", "slots"]].mean().reset_index()
         )
-        both = [table, everywhere.assign(place=ALL_PLACES)] if table["place"].nunique() > 1 else [table]
-        without = pd.concat(both)
-        paid = without[(without[list(TRAFFIC_WEIGHTS)] > 0).any(axis=1)]
-        without = without[(without[list(TRAFFIC_WEIGHTS)] == 0).all(axis=1)].drop(columns=list(TRAFFIC_WEIGHTS))
+        if table["place"].nunique() > 1:
+            table = pd.concat([table, everywhere.assign(place=ALL_PLACES)])
+        is_paid = (table[list(TRAFFIC_WEIGHTS)] > 0).any(axis=1)
+        paid, without = table[is_paid], table[~is_paid].drop(columns=list(TRAFFIC_WEIGHTS))
         pairs = paid.merge(without, on=["seed", *others, "place"], suffixes=("", "_without"))
         for values, group in pairs.groupby([*others, "place", *TRAFFIC_WEIGHTS], sort=False):
             cell = dict(zip([*others, "place", *TRAFFIC_WEIGHTS], values, strict=True))
@@ -110,19 +113,6 @@ def _claim(pairs: pd.DataFrame) -> dict[str, Any]:
     return row | dict(zip(("slots", "slots_low", "slots_high"), mean_interval(slots), strict=True))
 
 
-def _cells(results: Results) -> Iterable[tuple[dict[str, Any], pd.DataFrame]]:
-    axes = cell_axes(results.study)
-    for values, group in results.agents.groupby(axes, sort=False):
-        cell = dict(zip(axes, values, strict=True))
-        yield cell | {"place": cell.get("place", results.study.place)}, group
-
-
-def _place(results: Results, agent: Any) -> str:
-    return str(agent.get("place", results.study.place))
-
-
-def _first_failures(results: Results, policy: str) -> np.ndarray:
-    """``[A, n]`` share of the episodes in which each device is the first to fail."""
-    if policy in results.policies:
-        return results.first_failures(policy)
-    return np.asarray(results.evaluation[f"{policy}/first_failure"].mean(axis=1))
+def _other_axes(study: Study) -> list[str]:
+    """The axes of a cell that say neither where nor what traffic weighs."""
+    return [axis for axis in cell_axes(study) if axis not in ("place", *TRAFFIC_WEIGHTS)]

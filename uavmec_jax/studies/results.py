@@ -109,8 +109,12 @@ class Results:
         return pd.DataFrame(rows)
 
     def first_failures(self, policy: str) -> np.ndarray:
-        """``[A, n]`` how often each device of each agent's layout is the first to fail, over the held-out draws."""
-        return self.evaluation[f"{policy}/first_failure"][:, :-1].mean(axis=1)
+        """``[A, n]`` how often each device of each agent's layout is the first to fail, over the held-out draws.
+
+        A planner played the first few of them; a policy all, and the fixed draw behind them.
+        """
+        episodes = self.evaluation[f"{policy}/first_failure"]
+        return np.asarray((episodes if policy in PLANNERS else episodes[:, :-1]).mean(axis=1))
 
     def save(self, directory: Path) -> None:
         """Write every file of the run into ``directory``, each atomically; ``run.json`` last."""
