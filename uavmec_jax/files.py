@@ -1,11 +1,13 @@
-"""Files that are written whole or not at all, and arrays that are read without pickle."""
+"""Files that are written whole or not at all, text and TOML, and arrays that are read without pickle."""
 
 import hashlib
 import json
 import os
+import tomllib
 import zipfile
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
 from typing import IO, Any
@@ -93,12 +95,43 @@ def _digest(facts: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
 
 
 def _write(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:
-    partial = path.with_name(f".{path.name}.part")
+    with whole(path) as partial, partial.open("wb") as file:
+        fill(file)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+@contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """A file to fill that takes the place of ``path`` if all goes well, and is gone if not; it has the same ending."""
+    partial = path.with_name(f".{path.stem}.part{path.suffix}")
     try:
-        with partial.open("wb") as file:
-            fill(file)
-            file.flush()
-            os.fsync(file.fileno())
+        yield partial
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def read_text(path: Path, error: type[UserError], encoding: str = "utf-8") -> str:
+    """A text file.
+
+    Raises:
+        UserError: it cannot be read; of the type ``error``.
+    """
+    try:
+        return path.read_text(encoding=encoding)
+    except (OSError, UnicodeDecodeError) as problem:
+        reason = problem.strerror if isinstance(problem, OSError) else str(problem)
+        raise error(f"{path}: cannot be read: {reason}") from None
+
+
+def parse_toml(text: str, source: object, error: type[UserError]) -> dict[str, Any]:
+    """What a TOML file holds; ``source`` names it in messages.
+
+    Raises:
+        UserError: it is not TOML; of the type ``error``.
+    """
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as problem:
+        raise error(f"{source}: not TOML: {problem}") from None

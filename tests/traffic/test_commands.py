@@ -79,7 +79,7 @@ def test_bad_input_is_one_line_and_exit_code_2(tmp_path, monkeypatch, arguments,
         "x.osm": osm_town(),
         "broken.osm": osm_town()[:500],
         "empty.toml": "",
-        "x.sumocfg": "<configuration><output><summary-output value='/tmp/evil'/></output></configuration>",
+        "x.sumocfg": "<configuration><output><summary-output value='evil.xml'/></output></configuration>",
     }
     for name, text in files.items():
         (tmp_path / name).write_text(text)

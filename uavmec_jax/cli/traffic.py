@@ -157,7 +157,8 @@ def _changes(
     seeds: int | None,
 ) -> dict[str, Any]:
     """What the options change about a place, as tables of its file."""
-    from uavmec_jax.traffic.place import read_toml
+    from uavmec_jax.errors import TrafficError
+    from uavmec_jax.files import parse_toml, read_text
 
     demand = {"origins": origins or None, "exits": dict(map(_exit, exits)) or None, "vehicles": vehicles}
     given: dict[str, dict[str, Any]] = {"demand": demand, "simulation": {"seeds": seeds}}
@@ -170,7 +171,7 @@ def _changes(
             fail(f"--set {dotted}: name a table and a setting, e.g. demand.vehicles=2000")
         changes.setdefault(table, {})[name] = value
     if devices is not None:
-        changes["device"] = read_toml(devices).get("device", [])
+        changes["device"] = parse_toml(read_text(devices, TrafficError), devices, TrafficError).get("device", [])
         if not changes["device"]:
             fail(f"{devices}: holds no [[device]] tables")
     return changes

@@ -9,6 +9,7 @@ from matplotlib.animation import PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from uavmec_jax.files import whole
 from uavmec_jax.reporting.canvas import new_figure
 from uavmec_jax.reporting.road_map import density_key, draw_roads, draw_sites, frame
 from uavmec_jax.traffic.evacuation import Evacuation
@@ -40,18 +41,13 @@ def save_animation(
     slots = int(told.played.sum())
     figure = new_figure(9.6, 6.2)
     writer = PillowWriter(fps=_FRAMES_PER_S)
-    partial = path.with_name(f".{path.stem}.part{path.suffix}")
-    try:
-        with writer.saving(figure, str(partial), dpi=80):
-            for slot in range(slots):
-                figure.clear()
-                _draw_slot(figure, evacuation, params, layout, told, slot, title)
-                writer.grab_frame()
-            for _ in range(2 * _FRAMES_PER_S):  # the end stays a while
-                writer.grab_frame()
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with whole(path) as partial, writer.saving(figure, str(partial), dpi=80):
+        for slot in range(slots):
+            figure.clear()
+            _draw_slot(figure, evacuation, params, layout, told, slot, title)
+            writer.grab_frame()
+        for _ in range(2 * _FRAMES_PER_S):  # the end stays a while
+            writer.grab_frame()
     return slots
 
 

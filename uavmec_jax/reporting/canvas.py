@@ -5,15 +5,13 @@ from pathlib import Path
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from uavmec_jax.files import whole
+
 
 def save(figure: Figure, path: Path) -> None:
     """Write a figure, whole or not at all; the ending says the format."""
-    partial = path.with_name(f".{path.stem}.part{path.suffix}")
-    try:
+    with whole(path) as partial:
         figure.savefig(partial, dpi=144, metadata={"Software": None} if path.suffix == ".png" else None)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def new_figure(width: float, height: float) -> Figure:

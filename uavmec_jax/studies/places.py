@@ -51,8 +51,9 @@ def on_place(
         moving: their weights follow the evacuation's windows; by default they are its mean, as in the paper.
         scale_to_m: see :meth:`Evacuation.local_position`.
     """
-    weight = evacuation.window_weight if moving else evacuation.weight[None]
-    traffic = Traffic(weight=jnp.asarray(weight), window_s=jnp.float32(evacuation.meta["window_s"]))
+    traffic = Traffic(
+        weight=jnp.asarray(_weights(evacuation, moving)), window_s=jnp.float32(evacuation.meta["window_s"])
+    )
     position = jnp.asarray(evacuation.local_position(scale_to_m), jnp.float32)
     return replace(layout, position=position, traffic=traffic)
 
@@ -67,21 +68,20 @@ def onto_places(layouts: Layout, agents: Sequence[Mapping[str, Any]], study: Stu
     if not evacuations:
         return layouts
     own = [evacuations[agent.get("place", study.place)] for agent in agents]
-    moving = study.traffic == "moving"
-    windows = max(len(evacuation.window_weight) for evacuation in own)
-
-    def weight(evacuation: Evacuation) -> np.ndarray:
-        if not moving:
-            return evacuation.weight[None]
-        rest = windows - len(evacuation.window_weight)  # the last window lasts
-        return np.pad(evacuation.window_weight, ((0, rest), (0, 0)), mode="edge")
-
+    weights = [_weights(evacuation, study.traffic == "moving") for evacuation in own]
+    windows = max(map(len, weights))  # the last window lasts
+    padded = [np.pad(weight, ((0, windows - len(weight)), (0, 0)), mode="edge") for weight in weights]
     traffic = Traffic(
-        weight=jnp.asarray(np.stack([weight(evacuation) for evacuation in own])),
+        weight=jnp.asarray(np.stack(padded)),
         window_s=jnp.asarray([evacuation.meta["window_s"] for evacuation in own], jnp.float32),
     )
     position = np.stack([evacuation.local_position(study.place_scale_m) for evacuation in own])
     return replace(layouts, position=jnp.asarray(position, jnp.float32), traffic=traffic)
+
+
+def _weights(evacuation: Evacuation, moving: bool) -> np.ndarray:
+    """``[W, n]``: the weights of every window, or their mean alone."""
+    return evacuation.window_weight if moving else evacuation.weight[None]
 
 
 def describe_places(study: Study) -> dict[str, dict[str, Any]]:

@@ -2,7 +2,6 @@
 
 import itertools
 import math
-import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from importlib import resources
@@ -16,6 +15,7 @@ import pydantic
 import tomli_w
 
 from uavmec_jax.errors import StudyError
+from uavmec_jax.files import parse_toml
 from uavmec_jax.learning.algorithm import Agent, Algorithm
 from uavmec_jax.learning.registry import ALGORITHMS
 from uavmec_jax.studies.places import onto_places
@@ -69,10 +69,7 @@ def parse_study(text: str, source: str, overrides: Mapping[str, Any] | None = No
     Raises:
         StudyError: as :func:`load_study`.
     """
-    try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise StudyError(f"{source}: not TOML: {error}") from None
+    data = parse_toml(text, source, StudyError)
     for dotted, value in (overrides or {}).items():
         *parents, last = dotted.split(".")
         place = data

@@ -47,10 +47,8 @@ def build_evacuation(
             lambda done: on_progress(f"simulation {done} of {place.simulation.seeds}"),
         )
     first, last = place.simulation.windows
-    roads = list(network.roads.values())
-    shapes, lanes = [road.shape for road in roads], np.array([road.lanes for road in roads])
     names, position = place_devices(place, network, routes, found.density[:, first:last].mean(axis=(0, 1)))
-    near = density_near(position, shapes, lanes, found.density, place.devices.radius_m)  # [S, W, n]
+    near = density_near(position, network.shapes, network.lanes, found.density, place.devices.radius_m)  # [S, W, n]
     each = near[:, first:last].mean(axis=1)
     meta = {
         "place": place.name,
@@ -80,8 +78,8 @@ def build_evacuation(
         density_spread=each.std(axis=0, ddof=min(1, len(each) - 1)).astype(np.float32),
         weight=scaled(each.mean(axis=0)),
         window_weight=scaled(near.mean(axis=0)),
-        road_shape=np.concatenate(shapes).astype(np.float32),
-        road_corners=np.array([len(shape) for shape in shapes], np.int32),
-        road_lanes=lanes.astype(np.int32),
+        road_shape=np.concatenate(network.shapes).astype(np.float32),
+        road_corners=np.array([len(shape) for shape in network.shapes], np.int32),
+        road_lanes=network.lanes.astype(np.int32),
         road_density=found.density.mean(axis=0).astype(np.float32),
     )

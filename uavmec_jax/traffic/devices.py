@@ -78,14 +78,7 @@ def _inside(place: Place, network: RoadNetwork, routes: Routes) -> np.ndarray:
 
 def _chosen(placement: Placement, network: RoadNetwork, inside: np.ndarray, density: np.ndarray) -> list[str]:
     ids, position = list(network.junctions), np.array(list(network.junctions.values()))
-    roads = list(network.roads.values())
-    near = density_near(
-        position[inside],
-        [road.shape for road in roads],
-        np.array([road.lanes for road in roads], float),
-        density,
-        placement.radius_m,
-    )
+    near = density_near(position[inside], network.shapes, network.lanes, density, placement.radius_m)
     dense = inside[near >= np.quantile(near, _CORRIDOR_QUANTILE)]
     calm = inside[near <= np.median(near)]
     on_corridors = min(round(placement.corridor_share * placement.count), len(dense))

@@ -1,5 +1,6 @@
 """Road networks: made by netconvert from checked sources, kept by their hash, and read back as roads and junctions."""
 
+import contextlib
 import hashlib
 import re
 import shutil
@@ -13,6 +14,7 @@ import numpy as np
 import platformdirs
 
 from uavmec_jax.errors import TrafficError
+from uavmec_jax.files import whole
 from uavmec_jax.traffic import sumo
 from uavmec_jax.traffic.place import NetworkSource
 from uavmec_jax.traffic.reading import Contents, checked_copy
@@ -75,6 +77,16 @@ class RoadNetwork:
             for after in nexts:
                 found[after].append(road)
         return found
+
+    @cached_property
+    def shapes(self) -> list[np.ndarray]:
+        """The shape of each road, ``[k, 2]`` m."""
+        return [road.shape for road in self.roads.values()]
+
+    @cached_property
+    def lanes(self) -> np.ndarray:
+        """``[R]`` lanes of each road."""
+        return np.array([road.lanes for road in self.roads.values()])
 
     def leading_to(self, road: str) -> set[str]:
         """The roads from which a car can reach a road, itself among them."""
@@ -176,13 +188,10 @@ def _kept(options: list[str], workshop: Workshop) -> Path:
 
 def _keep(built: Path, kept: Path) -> None:
     """Keep a network for the next time; where that cannot be, there is no next time."""
-    partial = kept.with_suffix(".part")
-    try:
+    with contextlib.suppress(OSError):
         kept.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(built, partial)
-        partial.replace(kept)
-    except OSError:
-        partial.unlink(missing_ok=True)
+        with whole(kept) as partial:
+            shutil.copyfile(built, partial)
 
 
 def read_network(file: Path, name: str) -> RoadNetwork:

@@ -1,6 +1,5 @@
 """Places: where the road network comes from, who drives, where the devices are. Read from TOML, every number checked."""
 
-import tomllib
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
@@ -9,6 +8,7 @@ import pydantic
 from pydantic import Field
 
 from uavmec_jax.errors import TrafficError
+from uavmec_jax.files import parse_toml, read_text
 from uavmec_jax.world.inventory import MOST_DEVICES
 from uavmec_jax.world.settings import Strict, nearest, one_line
 
@@ -178,26 +178,11 @@ def load_place(source: str | Path, overrides: dict[str, Any] | None = None) -> t
             raise TrafficError(
                 f"{source}: neither a file nor a shipped place; {nearest(str(source), shipped_places())}"
             )
-    data = read_toml(path)
+    data = parse_toml(read_text(path, TrafficError), path, TrafficError)
     for table, settings in (overrides or {}).items():
         data[table] = data.get(table, {}) | settings if isinstance(settings, dict) else settings
     data.setdefault("name", path.stem)
     return make_place(data, str(path)), path.parent
-
-
-def read_toml(path: Path) -> dict[str, Any]:
-    """A TOML file.
-
-    Raises:
-        TrafficError: it cannot be read, or is not TOML.
-    """
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise TrafficError(f"{path}: cannot be read: {reason}") from None
-    except tomllib.TOMLDecodeError as error:
-        raise TrafficError(f"{path}: not TOML: {error}") from None
 
 
 def make_place(data: dict[str, Any], source: str) -> Place:

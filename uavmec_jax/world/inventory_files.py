@@ -2,13 +2,13 @@
 
 import csv
 import io
-import tomllib
 from pathlib import Path
 from typing import Any
 
 import tomli_w
 
 from uavmec_jax.errors import LayoutError
+from uavmec_jax.files import parse_toml, read_text
 from uavmec_jax.world.inventory import Device, Inventory, make_inventory
 from uavmec_jax.world.settings import tuples
 
@@ -26,22 +26,10 @@ def load_inventory(path: str | Path, overrides: dict[str, Any] | None = None) ->
     path = Path(path)
     if path.suffix.lower() not in (".toml", ".csv"):
         raise LayoutError(f"{path}: a layout file ends in .toml or .csv")
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise LayoutError(f"{path}: cannot be read: {reason}") from None
-    data = _from_csv(text) if path.suffix.lower() == ".csv" else _from_toml(text, path)
+    text = read_text(path, LayoutError, "utf-8-sig")
+    data = _from_csv(text) if path.suffix.lower() == ".csv" else tuples(parse_toml(text, path, LayoutError))
     data.setdefault("name", path.stem)
     return make_inventory(data, str(path), overrides)
-
-
-def _from_toml(text: str, path: Path) -> dict[str, Any]:
-    try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise LayoutError(f"{path}: not TOML: {error}") from None
-    return tuples(data)
 
 
 def _from_csv(text: str) -> dict[str, Any]:
