@@ -77,7 +77,7 @@ def ours(seeds: int, steps: int) -> list[float]:
     from uavmec_jax.learning import dqn, population
     from uavmec_jax.learning.algorithm import Agent
     from uavmec_jax.learning.blocks import plan_blocks
-    from uavmec_jax.learning.population import Validation
+    from uavmec_jax.learning.training import Validation
     from uavmec_jax.studies import host
     from uavmec_jax.world.environment import make_scenario
     from uavmec_jax.world.rollout import rollouts

@@ -16,11 +16,11 @@ from .planning.heuristics import HEURISTICS as HEURISTICS
 from .planning.lookahead import rollout_planner as rollout_planner
 from .planning.outlook import Outlook as Outlook
 from .planning.outlook import look_ahead as look_ahead
+from .studies.archive import load_results as load_results
 from .studies.places import on_place as on_place
 from .studies.policies import TrainedPolicy as TrainedPolicy
 from .studies.policies import load_policy as load_policy
 from .studies.results import Results as Results
-from .studies.results import load_results as load_results
 from .studies.run import run_study as run_study
 from .studies.schema import Study as Study
 from .studies.study import load_study as load_study

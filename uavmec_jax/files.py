@@ -26,10 +26,11 @@ def write_text(path: Path, text: str) -> None:
     _write(path, lambda file: file.write(text.encode()))
 
 
-def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write named arrays as a compressed ``.npz``, whole or not at all."""
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], *, compressed: bool = True) -> None:
+    """Write named arrays as an ``.npz``, whole or not at all."""
     named: dict[str, Any] = dict(arrays)
-    _write(path, lambda file: np.savez_compressed(file, **named))
+    save = np.savez_compressed if compressed else np.savez
+    _write(path, lambda file: save(file, **named))
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -48,17 +49,35 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
 _HEADER = "header"
 
 
-def write_checked(path: Path, schema: int, facts: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+def write_checked(
+    path: Path,
+    schema: int,
+    facts: Mapping[str, Any],
+    arrays: Mapping[str, np.ndarray],
+    *,
+    compressed: bool = True,
+) -> None:
     """Write named arrays under a header of facts (what JSON can hold), schema and SHA-256, whole or not at all."""
     header = {"schema": schema, "package": f"uavmec-jax {metadata.version('uavmec-jax')}", **facts}
     header["sha256"] = _digest(header, arrays)
-    write_arrays(path, {_HEADER: np.array(json.dumps(header)), **arrays})
+    write_arrays(path, {_HEADER: np.array(json.dumps(header)), **arrays}, compressed=compressed)
 
 
 def read_checked(
     path: Path, schema: int, what: str, error: type[UserError]
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The facts and the arrays that :func:`write_checked` wrote.
+    """The facts and the arrays that :func:`write_checked` wrote; see :func:`open_checked`."""
+    with open_checked(path, schema, what, error) as (facts, arrays):
+        return facts, dict(arrays)
+
+
+@contextmanager
+def open_checked(
+    path: Path, schema: int, what: str, error: type[UserError]
+) -> Iterator[tuple[dict[str, Any], Mapping[str, np.ndarray]]]:
+    """The facts that :func:`write_checked` wrote, and its arrays, each read when it is asked for.
+
+    All of them are checked first, one at a time: an archive may be larger than the memory that is free.
 
     Args:
         path: the file.
@@ -70,19 +89,43 @@ def read_checked(
         UserError: the file is not there, is damaged, was altered, is something else or of another version.
     """
     try:
-        arrays = load_arrays(path)
-    except StudyError as damage:
-        raise error(str(damage)) from None
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            facts = _checked_facts(path, archive, schema, what, error)
+            yield facts, _Members(archive)
+    except _DAMAGE as damage:
+        raise error(f"{path}: cannot be read: {damage}") from None
+
+
+class _Members(Mapping[str, np.ndarray]):
+    """The arrays of an archive, without its header."""
+
+    def __init__(self, archive: Any) -> None:
+        self._archive = archive
+        self._names = [name for name in archive.files if name != _HEADER]
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name not in self._names:
+            raise KeyError(name)
+        return np.asarray(self._archive[name])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+
+def _checked_facts(path: Path, archive: Any, schema: int, what: str, error: type[UserError]) -> dict[str, Any]:
     try:
-        facts = json.loads(str(arrays.pop(_HEADER)))
+        facts: dict[str, Any] = json.loads(str(archive[_HEADER]))
         found, digest = facts["schema"], facts.pop("sha256")
     except (KeyError, ValueError, TypeError):
         raise error(f"{path}: is not {what}, or one from before they had a header") from None
     if found != schema:
         raise error(f"{path}: schema is {found!r}; this version reads {schema}")
-    if digest != _digest(facts, arrays):
+    if digest != _digest(facts, _Members(archive)):
         raise error(f"{path}: was altered: its contents do not fit their SHA-256")
-    return facts, arrays
+    return facts
 
 
 def _digest(facts: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
@@ -90,7 +133,7 @@ def _digest(facts: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
     for name in sorted(arrays):
         leaf = np.ascontiguousarray(arrays[name])
         digest.update(f"{name} {leaf.dtype.str} {leaf.shape}".encode())
-        digest.update(leaf.tobytes())
+        digest.update(leaf.reshape(-1).view(np.uint8).data)
     return digest.hexdigest()
 
 

@@ -7,9 +7,10 @@ from numpy.testing import assert_array_equal
 
 from uavmec_jax.errors import StudyError
 from uavmec_jax.learning.population import Progress
+from uavmec_jax.studies.archive import load_results, load_weights
 from uavmec_jax.studies.evaluation import Distinct, Judgement
-from uavmec_jax.studies.results import load_results, load_weights
-from uavmec_jax.studies.run import plan_study, run_study
+from uavmec_jax.studies.plan import plan_study
+from uavmec_jax.studies.run import run_study
 from uavmec_jax.studies.study import parse_study
 
 TOML = """

@@ -8,9 +8,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from tests.traffic.towns import evacuation
 from uavmec_jax.errors import StudyError, TrafficError
 from uavmec_jax.reporting.tables import tables
+from uavmec_jax.studies.archive import load_results
+from uavmec_jax.studies.plan import plan_study
 from uavmec_jax.studies.policies import load_policy
-from uavmec_jax.studies.results import load_results
-from uavmec_jax.studies.run import plan_study, run_study
+from uavmec_jax.studies.run import run_study
 from uavmec_jax.studies.scenario import load_scenario
 from uavmec_jax.studies.study import cell_axes, identities, load_study, make_agents, parse_study, study_toml
 from uavmec_jax.traffic.evacuation import load_evacuation

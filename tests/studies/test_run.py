@@ -1,6 +1,7 @@
 """Whole runs: what they leave, and that it can be read back."""
 
 import json
+import shutil
 
 import numpy as np
 import pandas as pd
@@ -10,8 +11,9 @@ from numpy.testing import assert_array_equal
 from uavmec_jax.errors import PolicyError, StudyError
 from uavmec_jax.reporting import canvas, figures, tables
 from uavmec_jax.studies import host
-from uavmec_jax.studies.results import load_results, load_weights
-from uavmec_jax.studies.run import _BYTES_WITHOUT_TRAINING, check_directory, plan_study, run_study
+from uavmec_jax.studies.archive import load_results, load_weights
+from uavmec_jax.studies.plan import BYTES_WITHOUT_TRAINING, plan_study
+from uavmec_jax.studies.run import check_directory, run_study
 from uavmec_jax.studies.study import parse_study
 
 TOML = """
@@ -40,7 +42,16 @@ def finished(tmp_path_factory):
 def test_files_of_a_run(finished):
     _, directory = finished
     names = {file.name for file in directory.iterdir()}
-    assert names == {"study.toml", "run.json", "agents.csv", "curves.npz", "evaluation.npz", "weights.npz"}
+    assert names == {
+        "study.toml",
+        "run.json",
+        "agents.csv",
+        "curves.npz",
+        "evaluation.npz",
+        "weights.npz",
+        "plan.json",
+        "log",
+    }
     run = json.loads((directory / "run.json").read_text())
     assert run["complete"]
     assert run["command"] == "uavmec run tiny.toml"
@@ -157,6 +168,8 @@ def test_a_study_that_trains_nothing(tmp_path):
         "run.json",
         "agents.csv",
         "evaluation.npz",
+        "plan.json",
+        "log",
     }
     again = load_results(tmp_path / "none")
     assert_array_equal(again.evaluation["bound/lifetime"], results.evaluation["bound/lifetime"])
@@ -176,7 +189,7 @@ def test_the_figure_of_heuristics_alone(powered):
 def leave_room_for(agents, study, monkeypatch):
     """Pretend that the host has memory for so many agents in training."""
     plan = plan_study(study)
-    free = _BYTES_WITHOUT_TRAINING * plan.agents + agents * plan.blocks["dqn"].bytes // plan.blocks["dqn"].size
+    free = BYTES_WITHOUT_TRAINING * plan.agents + agents * plan.blocks["dqn"].bytes // plan.blocks["dqn"].size
     monkeypatch.setattr(host, "free_memory", lambda: free)
 
 
@@ -185,7 +198,7 @@ def test_blocks_one_after_the_other_give_every_agent_once(finished, monkeypatch)
     study = finished[0].study
     study = study.model_copy(update={"evaluation": study.evaluation.model_copy(update={"planners": ()})})
     leave_room_for(2, study, monkeypatch)
-    assert plan_study(study).n_blocks == 4
+    assert len(plan_study(study).shards) == 4
     pieces = run_study(study)
     assert pieces.run["complete"]
     pd.testing.assert_frame_equal(pieces.agents.iloc[:, :3], finished[0].agents.iloc[:, :3])
@@ -197,7 +210,7 @@ def test_blocks_one_after_the_other_give_every_agent_once(finished, monkeypatch)
 def test_interrupted_run_keeps_the_finished_blocks(finished, monkeypatch, tmp_path):
     study = parse_study(TOML, "tiny", {"evaluation.planners": [], "evaluation.baselines": []})
     leave_room_for(4, study, monkeypatch)
-    assert plan_study(study).n_blocks == 2
+    assert len(plan_study(study).shards) == 2
 
     def interrupt(progress):
         if progress.block == 1:
@@ -211,7 +224,7 @@ def test_interrupted_run_keeps_the_finished_blocks(finished, monkeypatch, tmp_pa
 def test_run_that_does_not_fit_is_refused_before_anything_is_written(finished, monkeypatch, tmp_path):
     with pytest.raises(StudyError, match=r"tiny: steps is 2000000000: one agent needs"):
         run_study(parse_study(TOML, "tiny", {"steps": 2 * 10**9, "dqn.replay_capacity": 2 * 10**9}), tmp_path / "big")
-    with pytest.raises(StudyError, match=r"8,000,000,000 agents need .* GiB before any of them trains"):
+    with pytest.raises(StudyError, match=r"8,000,000,000 agents need .* GiB of memory, and as much disk"):
         plan_study(parse_study(TOML, "tiny", {"axes.seeds": 2 * 10**9}))
     assert not (tmp_path / "big").exists()
 
@@ -228,9 +241,7 @@ def test_folder_that_is_taken_is_refused(finished, tmp_path):
 
 def damage(directory, tmp_path, name, content):
     copy = tmp_path / "copy"
-    copy.mkdir()
-    for file in directory.iterdir():
-        (copy / file.name).write_bytes(file.read_bytes())
+    shutil.copytree(directory, copy)
     (copy / name).write_bytes(content((directory / name).read_bytes()))
     return copy
 
@@ -261,6 +272,9 @@ def test_newer_schema_and_no_run(finished, tmp_path):
 
 def test_a_run_of_schema_1_can_be_read(finished, tmp_path):
     older = damage(finished[1], tmp_path, "run.json", lambda data: data.replace(b'"schema": 2', b'"schema": 1'))
+    run = json.loads((older / "run.json").read_text())
+    del run["sha256"]
+    (older / "run.json").write_text(json.dumps(run))
     with np.load(older / "curves.npz") as curves:
         np.savez(older / "curves.npz", **{name.removeprefix("dqn/"): curves[name] for name in curves.files})
     again = load_results(older)

@@ -6,6 +6,7 @@ import click
 
 from uavmec_jax.cli.common import fail
 from uavmec_jax.cli.machine import doctor
+from uavmec_jax.cli.runs import resume, status, submit, worker
 from uavmec_jax.cli.scenarios import evaluate, plan
 from uavmec_jax.cli.studies import compare, run, show, validate
 from uavmec_jax.cli.traffic import traffic
@@ -33,6 +34,8 @@ def main() -> None:
     \b
     uavmec run table5 --quick     the paper's Table 5 on this machine, in under a minute
     uavmec run my-study.toml      a study of your own
+    uavmec resume runs/...        go on with one that was stopped or killed
+    uavmec status runs/...        how far it is
     uavmec plan my-town.toml      tours for your own devices, what fails first, what to repair
     uavmec show runs/...          the tables of a run again
     uavmec traffic show albany    an evacuation, and which devices see it
@@ -41,5 +44,7 @@ def main() -> None:
     """
 
 
-for _command in (run, plan, evaluate, show, compare, validate, traffic, doctor):
+_COMMANDS = (run, resume, status, worker, submit, plan, evaluate, show, compare, validate, traffic, doctor)
+
+for _command in _COMMANDS:
     main.add_command(_command)

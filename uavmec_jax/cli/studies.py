@@ -1,13 +1,13 @@
 """Commands about studies and the runs they leave."""
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import click
 
 from uavmec_jax.cli.common import assignment, command_line, new_folder, print_results, print_tables
+from uavmec_jax.cli.runs import conclude, durability_options, tell_simulation, teller
 
 QUICK_STEPS, QUICK_SEEDS, QUICK_VALIDATE_EVERY = 50_000, 3, 5_000
 
@@ -28,6 +28,10 @@ QUICK_STEPS, QUICK_SEEDS, QUICK_VALIDATE_EVERY = 50_000, 3, 5_000
 )
 @click.option("--out", type=click.Path(path_type=Path), help="Folder of the run (default: runs/<study>-<time>).")
 @click.option("--json", "as_json", is_flag=True, help="Print the cells as JSON on standard output.")
+@durability_options
+@click.option("--simulate", is_flag=True, help="Print what the run would take, and run nothing.")
+@click.option("--speed", type=float, help="For --simulate: training steps per second of one device.")
+@click.option("--devices", type=int, help="For --simulate: number of devices (default: those of this machine).")
 def run(
     study: str,
     seeds: int | None,
@@ -36,8 +40,52 @@ def run(
     settings: tuple[str, ...],
     out: Path | None,
     as_json: bool,
+    simulate: bool,
+    speed: float | None,
+    devices: int | None,
+    workers: int,
+    shard_size: int | None,
+    **durability: Any,
 ) -> None:
     """Train and judge STUDY: a study that ships with the package (table5, table6, table7, planning, ...) or a TOML file."""
+    overrides = _overrides(quick, seeds, steps, settings)
+
+    from uavmec_jax.studies import host
+
+    host.use_every_core()
+    from rich.console import Console
+
+    from uavmec_jax.reporting.progress import progress_bar
+    from uavmec_jax.studies.durable.folder import Durability
+    from uavmec_jax.studies.plan import plan_study
+    from uavmec_jax.studies.run import check_directory, run_study
+    from uavmec_jax.studies.study import load_study
+
+    console = Console(stderr=as_json)
+    resolved = load_study(study, overrides)
+    if simulate:
+        tell_simulation(resolved, speed, devices, workers, shard_size, as_json)
+        return
+    directory = out or new_folder(resolved.name)
+    check_directory(directory)
+    plan = plan_study(resolved, workers=workers, shard_size=shard_size)
+    console.print(f"[bold]{resolved.name}[/bold]: {plan}")
+    with progress_bar(console, plan) as on_progress:
+        results = run_study(
+            resolved,
+            directory,
+            command=command_line(),
+            workers=workers,
+            shard_size=shard_size,
+            durability=Durability(**durability),
+            on_progress=on_progress,
+            on_event=teller(console),
+        )
+    conclude(results, directory, console, as_json)
+
+
+def _overrides(quick: bool, seeds: int | None, steps: int | None, settings: tuple[str, ...]) -> dict[str, Any]:
+    """What the options change in a study."""
     overrides: dict[str, Any] = {}
     if quick:
         overrides |= {
@@ -47,34 +95,7 @@ def run(
             "evaluation.planner_draws": 1,
         }
     overrides |= {name: value for name, value in (("axes.seeds", seeds), ("steps", steps)) if value is not None}
-    overrides |= dict(assignment(setting) for setting in settings)
-
-    from uavmec_jax.studies import host
-
-    host.use_every_core()
-    from rich.console import Console
-
-    from uavmec_jax.reporting import canvas, figures
-    from uavmec_jax.reporting.progress import progress_bar
-    from uavmec_jax.studies.run import check_directory, plan_study, run_study
-    from uavmec_jax.studies.study import load_study
-
-    console = Console(stderr=as_json)
-    resolved = load_study(study, overrides)
-    directory = out or new_folder(resolved.name)
-    check_directory(directory)
-    plan = plan_study(resolved)
-    console.print(f"[bold]{resolved.name}[/bold]: {plan}")
-    with progress_bar(console, plan) as on_progress:
-        results = run_study(resolved, directory, command=command_line(), on_progress=on_progress)
-    if len(results.agents):
-        canvas.save(figures.run_figure(results), directory / "figure.png")
-        print_results(results, directory, console, as_json)
-    if not results.run["complete"]:
-        done = len(results.agents)
-        kept = f"{done} finished agents are kept in {directory}" if done else "no block was finished, nothing was kept"
-        click.echo(f"interrupted: {kept}", err=True)
-        sys.exit(130)
+    return overrides | dict(assignment(setting) for setting in settings)
 
 
 @click.command()
@@ -84,7 +105,7 @@ def show(directory: Path, as_json: bool) -> None:
     """Print the tables of the run in DIRECTORY again."""
     from rich.console import Console
 
-    from uavmec_jax.studies.results import load_results
+    from uavmec_jax.studies.archive import load_results
 
     results = load_results(directory)
     print_results(results, directory, Console(stderr=as_json), as_json)
@@ -111,8 +132,8 @@ def compare(
     from rich.console import Console
 
     from uavmec_jax.reporting.compare import comparison
+    from uavmec_jax.studies.archive import load_results
     from uavmec_jax.studies.compare import Side
-    from uavmec_jax.studies.results import load_results
 
     a = Side(load_results(run_a), policy_a, dict(assignment(one, "--a") for one in where_a))
     b = Side(load_results(run_b), policy_b, dict(assignment(one, "--b") for one in where_b))

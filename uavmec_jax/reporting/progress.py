@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from uavmec_jax.learning.population import Progress as News
-from uavmec_jax.studies.run import Plan
+from uavmec_jax.studies.plan import Plan
 
 
 @contextmanager
@@ -33,7 +33,7 @@ def progress_bar(console: Console, plan: Plan) -> Iterator[Callable[[News], None
             bar.update(
                 task,
                 completed=news.steps,
-                description=f"block {news.block + 1}/{plan.n_blocks}",
+                description=f"shard {news.block + 1}/{len(plan.shards)}",
                 speed=f"{speed:,.0f}" if speed else "-",
                 length="-" if math.isnan(news.mean_length) else f"{news.mean_length:.1f}",
             )

@@ -18,6 +18,7 @@ from uavmec_jax.errors import PolicyError
 from uavmec_jax.files import read_checked, write_checked
 from uavmec_jax.learning.algorithm import Algorithm
 from uavmec_jax.learning.registry import ALGORITHMS
+from uavmec_jax.studies.schema import Study
 from uavmec_jax.world.settings import tuples
 
 SCHEMA = 1
@@ -42,6 +43,19 @@ class Collection:
     n_devices: int
     agents: Mapping[str, list[dict[str, Any]]]
     weights: Mapping[str, np.ndarray]
+
+    @classmethod
+    def of_study(
+        cls, study: Study, agents: Mapping[str, list[dict[str, Any]]], weights: Mapping[str, Any]
+    ) -> "Collection":
+        """Agents of a study, ``weights`` by algorithm and kind: nested, or flat with ``/``."""
+        place = {"place": study.place} if study.place else {}
+        return cls(
+            settings={name: getattr(study, name).model_dump(mode="json") for name in agents},
+            n_devices=study.params.n_devices,
+            agents={name: [dict(who) | place for who in own] for name, own in agents.items()},
+            weights=traverse_util.flatten_dict(dict(weights), sep="/"),
+        )
 
     def weights_of(self, which: str, algorithm: str | None = None) -> dict[str, Any]:
         """Weights as the networks take them, leaves ``[A, ...]``; by default of the first algorithm.

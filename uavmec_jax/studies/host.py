@@ -1,9 +1,12 @@
 """The machine a run happens on: its cores, memory and versions."""
 
+import hashlib
 import os
 import platform
 import sys
+from functools import cache
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -13,14 +16,26 @@ MEMORY_SHARE = 0.8
 """Share of the free memory that a run may plan with."""
 
 
-def use_every_core() -> None:
+def use_every_core(share: tuple[int, int] | None = None) -> None:
     """Make every CPU core a device of its own; call before JAX is first used.
 
     Agents are split over the devices, and each then works in its own core's cache: nearly twice as fast as one device
     that spreads every small operation over the cores. Without effect once JAX has started, or if the user has already
     set a number of devices.
+
+    Args:
+        share: ``(i, n)``: keep to the i-th of n equal parts of the cores (at least one), from 1.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+    if hasattr(os, "sched_getaffinity"):
+        mine = sorted(os.sched_getaffinity(0))
+        if share is not None:
+            part = max(len(mine) // share[1], 1)
+            first = (share[0] - 1) * part % len(mine)
+            mine = mine[first : first + part]
+            os.sched_setaffinity(0, mine)
+        cores = len(mine)
+    else:
+        cores = max((os.cpu_count() or 1) // (share[1] if share else 1), 1)
     if "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
         return
     try:
@@ -50,13 +65,28 @@ def processor() -> str:
     return platform.processor() or platform.machine()
 
 
+def versions() -> dict[str, str]:
+    """Of what decides over the bits of a run."""
+    packages = ("uavmec-jax", "jax", "jaxlib", "flax", "optax", "numpy", "scipy", "pandas")
+    return {name: version(name) for name in packages}
+
+
+@cache
+def code_digest() -> str:
+    """SHA-256 of this package's source files."""
+    digest = hashlib.sha256()
+    root = Path(__file__).parents[1]
+    for file in sorted(root.rglob("*.py")):
+        digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()
+
+
 def describe() -> dict[str, Any]:
     """Versions and hardware, for ``run.json`` and ``uavmec doctor``."""
-    packages = ("uavmec-jax", "jax", "jaxlib", "flax", "optax", "numpy", "scipy", "pandas")
     return {
         "python": sys.version.split()[0],
         "platform": platform.platform(),
-        "versions": {name: version(name) for name in packages},
+        "versions": versions(),
         "processor": processor(),
         "cores": psutil.cpu_count() or 1,
         "memory_gib": round(psutil.virtual_memory().total / 2**30, 1),

@@ -1,7 +1,8 @@
 """What a run leaves: files that are read back without pickle, each written whole or not at all."""
 
+import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,19 +11,19 @@ import numpy as np
 import pandas as pd
 from flax import traverse_util
 
-from uavmec_jax.errors import StudyError
-from uavmec_jax.files import load_arrays, write_arrays, write_text
-from uavmec_jax.studies.collection import WEIGHTS, Collection, read_collection, write_collection
+from uavmec_jax.files import write_arrays, write_text
+from uavmec_jax.studies.collection import WEIGHTS, Collection, write_collection
 from uavmec_jax.studies.evaluation import device_number
 from uavmec_jax.studies.schema import PLANNERS, Study
+from uavmec_jax.studies.shard import Finished
 from uavmec_jax.studies.statistics import mean_interval
-from uavmec_jax.studies.study import cell_axes, load_study, study_toml
+from uavmec_jax.studies.study import cell_axes, study_toml
 
 SCHEMA = 2
 """Version of the run folder. In version 1 curves and weights did not name their algorithm: it was the DQN."""
 
-_STUDY, _RUN, _AGENTS = "study.toml", "run.json", "agents.csv"
-_CURVES, _EVALUATION = "curves.npz", "evaluation.npz"
+STUDY, RUN, AGENTS = "study.toml", "run.json", "agents.csv"
+CURVES, EVALUATION = "curves.npz", "evaluation.npz"
 
 
 @dataclass
@@ -70,15 +71,53 @@ class Results:
         """Learned policies to be held against oldest-first, layout by layout."""
         return [name for name in ("best", "last") if {name, "oldest_first"} <= set(self.policies)]
 
-    def add(
-        self, algorithm: str, rows: pd.DataFrame, curves: Mapping, evaluation: Mapping, weights: Mapping[str, Any]
-    ) -> None:
-        """Append the agents of one more block of an algorithm."""
-        self.agents = pd.concat([self.agents, rows], ignore_index=True)
-        if curves:
-            _append(self.curves.setdefault(algorithm, {}), curves)
-        _append(self.evaluation, evaluation)
-        _append(self.weights, traverse_util.flatten_dict({algorithm: dict(weights)}, sep="/") if weights else {})
+    @classmethod
+    def of(cls, study: Study, label: Mapping[str, Any], shards: Iterable[Finished], agents: int) -> "Results":
+        """Put finished shards together, in the order of the plan.
+
+        Args:
+            study: the resolved study.
+            label: of the run.
+            shards: those that are finished.
+            agents: how many there are when all are finished.
+        """
+        made = cls(study, dict(label))
+        seconds: dict[str, float] = {}
+        rows: list[pd.DataFrame] = []
+        curves: dict[str, list[Mapping]] = {}
+        evaluation, weights = [], []
+        steps = 0
+        for shard in shards:
+            rows.append(shard.rows)
+            evaluation.append(shard.evaluation)
+            if shard.curves:
+                curves.setdefault(shard.algorithm, []).append(shard.curves)
+                weights.append(traverse_util.flatten_dict({shard.algorithm: shard.weights}, sep="/"))
+            steps += shard.steps
+            for activity, spent in shard.seconds.items():
+                seconds[activity] = seconds.get(activity, 0.0) + spent
+        made.agents = pd.concat(rows, ignore_index=True) if rows else pd.DataFrame()
+        made.curves = {name: _joined(own) for name, own in curves.items()}
+        made.evaluation, made.weights = _joined(evaluation), _joined(weights)
+        made._measure(agents, steps, seconds)
+        return made
+
+    def _measure(self, agents: int, steps: int, seconds: dict[str, float]) -> None:
+        """Add to the label what the finished shards took: seconds of all workers together, but for the wall time."""
+        seconds = seconds | {"wall": seconds.get("wall", 0.0) / self.run.get("workers", 1)}
+        self.run |= {
+            "complete": len(self.agents) == agents,
+            "agents_done": len(self.agents),
+            "seconds": {name: round(spent, 2) for name, spent in seconds.items()},
+        }
+        if steps:
+            self.run |= {
+                "diverged": int((self.agents["diverged_at"] >= 0).sum()),
+                "environment_steps": steps,
+                "training_steps_per_second": round(steps / seconds["train"]),
+                "validation_share": round(seconds["validate"] / (seconds["train"] + seconds["validate"]), 4),
+                "snapshot_share": round(seconds.get("snapshot", 0.0) / seconds["train"], 4),
+            }
 
     def cells(self) -> pd.DataFrame:
         """One row per cell: means and intervals over the seeds, paired differences to oldest-first, who fails first."""
@@ -117,109 +156,42 @@ class Results:
         return np.asarray((episodes if policy in PLANNERS else episodes[:, :-1]).mean(axis=1))
 
     def save(self, directory: Path) -> None:
-        """Write every file of the run into ``directory``, each atomically; ``run.json`` last."""
+        """Write every file of the run into ``directory``, each atomically; ``run.json``, with their SHA-256, last."""
         directory.mkdir(parents=True, exist_ok=True)
-        write_text(directory / _STUDY, study_toml(self.study))
-        write_text(directory / _AGENTS, self.agents.to_csv(index=False, float_format="%.6g"))
+        write_text(directory / STUDY, study_toml(self.study))
+        if len(self.agents):
+            write_text(directory / AGENTS, self.agents.to_csv(index=False, float_format="%.6g"))
         for name, arrays in (
-            (_CURVES, traverse_util.flatten_dict(self.curves, sep="/")),
-            (_EVALUATION, self.evaluation),
+            (CURVES, traverse_util.flatten_dict(self.curves, sep="/")),
+            (EVALUATION, self.evaluation),
         ):
             if arrays:  # nothing was trained: no curves, no weights
                 write_arrays(directory / name, arrays)
         if self.weights:
             write_collection(directory / WEIGHTS, self._collection())
-        write_text(directory / _RUN, json.dumps(self.run, indent=1) + "\n")
+        written = [directory / name for name in (STUDY, AGENTS, CURVES, EVALUATION, WEIGHTS)]
+        digests = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in written if file.exists()}
+        write_text(directory / RUN, json.dumps(self.run | {"sha256": digests}, indent=1) + "\n")
 
     def _collection(self) -> Collection:
         """The weights with all that is needed to make policies of them."""
-        axes = ["seed", *cell_axes(self.study)]
-        agents: dict[str, list[dict[str, Any]]] = {}
-        for row in json.loads(self.agents[axes].to_json(orient="records", double_precision=15)):
-            row |= {"place": self.study.place} if self.study.place else {}
-            agents.setdefault(row.get("algorithm", self.study.algorithm), []).append(row)
-        return Collection(
-            settings={name: getattr(self.study, name).model_dump(mode="json") for name in self.study.algorithms},
-            n_devices=self.study.params.n_devices,
-            agents=agents,
-            weights=self.weights,
-        )
+        agents: dict[str, list[dict[str, Any]]] = {name: [] for name in self.study.algorithms}
+        axes = self.agents[["seed", *cell_axes(self.study)]]
+        for row in json.loads(axes.to_json(orient="records", double_precision=15)):
+            agents[row.get("algorithm", self.study.algorithm)].append(row)
+        finished = {name: own for name, own in agents.items() if own}
+        return Collection.of_study(self.study, finished, self.weights)
 
 
-def _append(mine: dict[str, np.ndarray], theirs: Mapping[str, Any]) -> None:
-    """Arrays with an axis of agents grow by those of a block; the steps of curves are shared by all."""
-    for name, values in theirs.items():
-        grows = name in mine and not name.endswith("_steps")
-        mine[name] = np.concatenate([mine[name], values]) if grows else np.asarray(values)
+def _joined(pieces: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
+    """Arrays with an axis of agents, one after the other; the steps of curves are shared by all."""
+    found: dict[str, list[np.ndarray]] = {}
+    for piece in pieces:
+        for name, values in piece.items():
+            found.setdefault(name, []).append(np.asarray(values))
+    return {name: own[0] if name.endswith("_steps") else np.concatenate(own) for name, own in found.items()}
 
 
 def _first_to_fail(policy: str, share: np.ndarray) -> dict[str, Any]:
     """The device (from 1, 0 for none) that is first most often, of ``share [n]``."""
     return {f"{policy}_first_device": device_number(share), f"{policy}_first_share": float(share.max())}
-
-
-def holds_run(directory: Path) -> bool:
-    """Whether a folder holds a run."""
-    return (directory / _RUN).exists() or (directory / _STUDY).exists()
-
-
-def load_results(directory: str | Path) -> Results:
-    """Read a run back (all but its weights, see :func:`load_weights`).
-
-    Raises:
-        StudyError: the folder holds no run, a file of it is damaged, or it was written by a newer version.
-    """
-    directory = Path(directory)
-    run = _read_run(directory)
-    try:
-        agents = _read_table(directory / _AGENTS)
-    except (OSError, ValueError) as error:
-        raise StudyError(f"{directory}: cannot be read: {error}") from None
-    study = load_study(directory / _STUDY)
-    return Results(
-        study=study,
-        run=run,
-        agents=agents,
-        curves=_nested_curves(directory / _CURVES, run.get("schema", 1)) if study.algorithms else {},
-        evaluation=load_arrays(directory / _EVALUATION),
-    )
-
-
-def _read_run(directory: Path) -> dict[str, Any]:
-    """What ``run.json`` holds."""
-    path = directory / _RUN
-    if not path.is_file():
-        raise StudyError(f"{directory}: holds no run ({_RUN} is not there)")
-    try:
-        run: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise StudyError(f"{directory}: cannot be read: {error}") from None
-    if run.get("schema", SCHEMA) > SCHEMA:
-        raise StudyError(f"{path}: schema is {run['schema']}; this version reads up to {SCHEMA}")
-    return run
-
-
-def _read_table(path: Path) -> pd.DataFrame:
-    """The tidy table; lists of device numbers stay text, also where they are empty or one number."""
-    lists = {name: str for name in pd.read_csv(path, nrows=0).columns if name.endswith("_devices_fixed")}
-    return pd.read_csv(path, dtype=lists, keep_default_na=False)
-
-
-def load_weights(directory: str | Path, which: str = "best", algorithm: str | None = None) -> dict[str, Any]:
-    """Trained weights of a run as the networks take them, leaves ``[A, ...]`` in the order of ``agents.csv``.
-
-    Args:
-        directory: of the run.
-        which: ``"best"`` or ``"last"``.
-        algorithm: whose agents; by default the first algorithm of the run.
-
-    Raises:
-        PolicyError: there are none, or the file is damaged.
-    """
-    return read_collection(Path(directory) / WEIGHTS).weights_of(which, algorithm)
-
-
-def _nested_curves(path: Path, schema: int) -> dict[str, Any]:
-    """Curves by algorithm."""
-    nested: dict[str, Any] = traverse_util.unflatten_dict(load_arrays(path), sep="/")
-    return nested if schema > 1 else {"dqn": nested}

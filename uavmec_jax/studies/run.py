@@ -1,105 +1,35 @@
-"""Run a study: plan it, train it, judge it, keep it."""
+"""Run a study: in this process or by several, in one go or taken up again; and put together what they left."""
 
 import datetime
+import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import jax
-import pandas as pd
-
 from uavmec_jax.errors import StudyError
-from uavmec_jax.learning import population
-from uavmec_jax.learning.algorithm import Agent, Algorithm
-from uavmec_jax.learning.blocks import Blocks, PopulationTooLargeError, plan_blocks
-from uavmec_jax.learning.population import Progress, TrainedBlock, Validation
+from uavmec_jax.learning.population import Progress
 from uavmec_jax.studies import host
-from uavmec_jax.studies.evaluation import Distinct, Judgement, judge_all, judge_learned
-from uavmec_jax.studies.places import describe_places, load_evacuations
-from uavmec_jax.studies.results import SCHEMA, Results, holds_run
-from uavmec_jax.studies.schema import TRACED_PARAMS, Study
-from uavmec_jax.studies.study import (
-    evaluation_keys,
-    identities,
-    make_agents,
-    make_algorithm,
-    n_agents,
-    parts,
-    seeds_of,
-    validation_keys,
-)
-from uavmec_jax.world.rewards import make_reward
+from uavmec_jax.studies.archive import holds_run, load_results, partial_results, put_together, set_damaged_aside
+from uavmec_jax.studies.durable.folder import PLAN, SHARDS, Durability, RunFolder
+from uavmec_jax.studies.durable.leases import Leases
+from uavmec_jax.studies.durable.stopping import Stop
+from uavmec_jax.studies.durable.team import work_together
+from uavmec_jax.studies.durable.worker import make_worker
+from uavmec_jax.studies.places import describe_places
+from uavmec_jax.studies.plan import Plan, plan_study
+from uavmec_jax.studies.results import SCHEMA, Results
+from uavmec_jax.studies.schema import Study
+from uavmec_jax.studies.shard import Bench, Finished
+from uavmec_jax.studies.study import seeds_of
 
+OnProgress = Callable[[Progress], None]
+OnEvent = Callable[[str, dict[str, Any]], None]
+RewardFunction = Callable[[Mapping[str, Any]], Any]
 
-@dataclass(frozen=True)
-class Plan:
-    """What a run will take, known before anything is compiled or written."""
-
-    agents: int
-    total_steps: int
-    blocks: dict[str, Blocks]
-    """Algorithm -> how its agents are cut."""
-    free_bytes: int
-
-    @property
-    def n_blocks(self) -> int:
-        """Blocks of all algorithms."""
-        return sum(blocks.count for blocks in self.blocks.values())
-
-    def __str__(self) -> str:
-        if not self.total_steps:
-            return f"{self.agents} scenarios, nothing is trained"
-        every = list(self.blocks.values())
-        each = self.n_blocks > 1
-        sizes = "+".join(f"{blocks.count} x {blocks.size}" for blocks in every)
-        cut = f"{self.n_blocks} block{'s' * each}{f' ({sizes})' if len(every) > 1 else f' of {every[0].size}'}"
-        memory = f"{max(b.bytes for b in every) / 2**30:.2f} GiB of {self.free_bytes / 2**30:.1f} GiB free"
-        devices = max(blocks.devices for blocks in every)
-        return (
-            f"{self.agents} agents x {self.total_steps // self.agents:,} steps in {cut} "
-            f"on {devices} device{'s' * (devices > 1)}, {memory}"
-        )
-
-
-def plan_study(study: Study) -> Plan:
-    """Estimate memory and cut the population into blocks.
-
-    Raises:
-        StudyError: the population does not fit in memory.
-        TrafficError: a place of the study is not usable.
-    """
-    load_evacuations(study)
-    agents, free = n_agents(study), host.free_memory()
-    needed = agents * _BYTES_WITHOUT_TRAINING
-    if needed > free:
-        raise StudyError(
-            f"{study.name}: {agents:,} agents need {needed / 2**30:,.0f} GiB before any of them trains, "
-            f"{free / 2**30:.1f} GiB are free; shorten an axis"
-        )
-    blocks: dict[str, Blocks] = {}
-    total_steps = 0
-    for part in parts(study):
-        algorithm, members = make_algorithm(part), n_agents(part)
-        if algorithm is None:
-            size = min(_UNTRAINED_BLOCK, members)
-            blocks[part.algorithm] = Blocks(-(-members // size), size, jax.local_device_count(), bytes=0)
-            continue
-        try:
-            blocks[part.algorithm] = plan_blocks(members, algorithm.agent_bytes, free - needed)
-        except PopulationTooLargeError as error:
-            raise StudyError(f"{study.name}: steps is {study.steps}: {error}") from None
-        total_steps += members * algorithm.total_steps
-    return Plan(agents=agents, total_steps=total_steps, blocks=blocks, free_bytes=free)
-
-
-_UNTRAINED_BLOCK = 100
-"""Scenarios between two savings where nothing is trained."""
-
-_BYTES_WITHOUT_TRAINING = 100_000
-"""An agent that waits for its block or is done: layout, keys, two sets of weights, evaluation."""
+_HELP = "; to help it, start `uavmec worker {}`"
 
 
 def check_directory(directory: Path) -> None:
@@ -108,24 +38,32 @@ def check_directory(directory: Path) -> None:
     Raises:
         StudyError: it holds a run or something else, or is a file.
     """
-    if holds_run(directory):
-        raise StudyError(f"{directory}: already holds a run; give another folder with --out")
-    if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
+    if holds_run(directory) or (directory / PLAN).exists():
+        raise StudyError(
+            f"{directory}: already holds a run; go on with it by `uavmec resume`, or give another folder with --out"
+        )
+    if directory.exists() and not directory.is_dir():
+        raise StudyError(f"{directory}: exists and is not an empty folder; give another one with --out")
+    if directory.exists() and any(file.name != SHARDS for file in directory.iterdir()):
         raise StudyError(f"{directory}: exists and is not an empty folder; give another one with --out")
 
 
 def run_study(
     study: Study,
-    directory: Path | None = None,
+    directory: str | Path | None = None,
     *,
-    reward: Callable[[Mapping[str, Any]], Any] | None = None,
+    reward: RewardFunction | None = None,
     command: str | None = None,
-    on_progress: Callable[[Progress], None] = lambda _: None,
+    workers: int = 1,
+    shard_size: int | None = None,
+    durability: Durability | None = None,
+    on_progress: OnProgress = lambda _: None,
+    on_event: OnEvent = lambda event, facts: None,
 ) -> Results:
     """Train and judge the population of a study.
 
-    After each block the finished agents are saved. Ctrl-C ends the run early: the results then hold the finished
-    blocks and ``run["complete"]`` is False.
+    In a directory the run survives whatever happens: see :func:`resume_run`. Ctrl-C or SIGTERM end it early; the results
+    then hold the finished shards, ``run["complete"]`` is False and ``run["stopped_by"]`` is the signal's number.
 
     Args:
         study: from :func:`uavmec_jax.studies.study.load_study`.
@@ -133,122 +71,215 @@ def run_study(
         reward: a function of the terms (see :func:`um.make_reward`) in place of the study's reward; the run's label
             then names it.
         command: the command line, for the label of the results.
+        workers: processes; more than one need a directory.
+        shard_size: most agents in a shard; by default what the devices' caches hold.
+        durability: how the run is kept.
         on_progress: told after every chunk.
+        on_event: told ``(event, facts)`` of everything that is logged.
 
     Raises:
-        StudyError: the population does not fit, the directory cannot take a run, or ``reward`` stands beside an axis of
-            rewards.
+        StudyError: the population does not fit, the directory cannot take a run or somebody is at work in it, shards
+            have failed, or ``reward`` stands beside an axis of rewards.
     """
-    if directory is not None:
-        check_directory(directory)
     if reward is not None and "reward" in study.axes:
         raise StudyError(f"{study.name}: axes.reward is given, and a reward function too; leave one of them out")
-    plan = plan_study(study)
-    started = time.perf_counter()
-    results = Results(study=study, run=_label(study, plan, command))
+    if workers > 1 and (directory is None or reward is not None):
+        raise StudyError(
+            f"{study.name}: workers is {workers}; several processes need a directory and no reward function"
+        )
+    if directory is not None:
+        check_directory(Path(directory))
+    plan = plan_study(study, workers=workers, shard_size=shard_size)
+    label = _label(study, plan, command)
     if reward is not None:
-        results.run["reward_function"] = getattr(reward, "__qualname__", repr(reward))
-    seconds: dict[str, float] = {"evaluate": 0.0, "plan": 0.0}
-    steps_before = 0
+        label["reward_function"] = getattr(reward, "__qualname__", repr(reward))
+    bench = Bench(study, plan, reward)
+    if directory is None:
+        return _run_in_memory(study, plan, bench, label, on_progress)
+    path = Path(directory)
+    durability = durability or Durability()
+    lease = Leases(durability.lease_s).hold(path / SHARDS, _HELP.format(path))
     try:
-        for part in parts(study):
-            own = make_reward(reward, study.guard) if reward is not None else None
-            members = _Population(part, make_algorithm(part), make_agents(part, own), evaluation_keys(part))
-            report = _report(on_progress, plan, part.algorithm, steps_before)
-            for place, trained in members.blocks(plan.blocks[part.algorithm], report):
-                members.finish(results, place, trained, seconds)
-                steps_before += (place.stop - place.start) * members.steps
-                for activity, spent in trained.seconds.items() if trained else ():
-                    seconds[activity] = seconds.get(activity, 0.0) + spent
-                _measure(results, plan, steps_before, seconds, time.perf_counter() - started)
-                if directory is not None:
-                    results.save(directory)
-    except KeyboardInterrupt:
-        results.run["complete"] = False
-    return results
+        check_directory(path)
+        RunFolder.create(path, study, plan, durability, label)
+        return _run(path, bench, workers, on_progress, on_event)
+    finally:
+        lease.release()
 
 
-def _report(
-    on_progress: Callable[[Progress], None], plan: Plan, algorithm: str, steps_before: int
-) -> Callable[[Progress], None]:
-    """News of one algorithm as news of the whole run."""
-    names = list(plan.blocks)
-    blocks_before = sum(plan.blocks[name].count for name in names[: names.index(algorithm)])
+def prepare_run(
+    study: Study,
+    directory: str | Path,
+    *,
+    command: str | None = None,
+    workers: int = 1,
+    shard_size: int | None = None,
+    jobs: int = 1,
+    durability: Durability | None = None,
+) -> RunFolder:
+    """Plan a run that workers (:func:`work_on`) then make.
 
-    def report(news: Progress) -> None:
-        steps, of_steps = steps_before + news.steps, plan.total_steps or plan.agents
-        on_progress(replace(news, block=blocks_before + news.block, steps=steps, of_steps=of_steps))
+    Args:
+        study, directory, command, shard_size, durability: see :func:`run_study`.
+        workers: processes that share one machine.
+        jobs: workers on all machines together.
 
-    return report
+    Raises:
+        StudyError: see :func:`run_study`.
+    """
+    path, durability = Path(directory), durability or Durability()
+    check_directory(path)
+    plan = plan_study(study, workers=workers, shard_size=shard_size, jobs=jobs)
+    lease = Leases(durability.lease_s).hold(path / SHARDS, _HELP.format(path))
+    try:
+        check_directory(path)
+        return RunFolder.create(path, study, plan, durability, _label(study, plan, command))
+    finally:
+        lease.release()
 
 
-@dataclass(frozen=True)
-class _Population:
-    """The agents of one algorithm of a study, or those that nothing trains."""
+def resume_run(
+    directory: str | Path,
+    *,
+    reward: RewardFunction | None = None,
+    workers: int = 1,
+    other_code: bool = False,
+    on_progress: OnProgress = lambda _: None,
+    on_event: OnEvent = lambda event, facts: None,
+) -> Results:
+    """Go on with a run that was stopped or killed; it ends with the bits of a run that was not.
 
-    study: Study
-    algorithm: Algorithm | None
-    agents: Agent
-    keys: Any
+    Finished shards are kept, the others go on from their last sound snapshot; shards that failed are tried again.
 
-    @property
-    def steps(self) -> int:
-        """Environment steps of one agent."""
-        return self.algorithm.total_steps if self.algorithm else 0
+    Args:
+        directory: of the run.
+        reward: the function that the run was started with, if it was.
+        workers: processes.
+        other_code: go on although code or libraries are not those that planned the run; its label then says so.
+        on_progress: told after every chunk.
+        on_event: told ``(event, facts)`` of everything that is logged.
 
-    def blocks(
-        self, cut: Blocks, on_progress: Callable[[Progress], None]
-    ) -> Iterator[tuple[slice, TrainedBlock | None]]:
-        """Block after block, trained if the study trains; if not, progress counts scenarios."""
-        if self.algorithm is None:
-            n = self.keys.shape[0]
-            for block in range(cut.count):
-                place = slice(block * cut.size, min((block + 1) * cut.size, n))
-                yield place, None
-                on_progress(Progress(block, place.stop, n, float("nan")))
-            return
-        settings = self.study.evaluation
-        validation = Validation(every=settings.validate_every, draws=settings.validation_draws)
-        for trained in population.train(
-            self.algorithm,
-            self.agents,
-            validation_keys(self.study),
-            validation=validation,
-            blocks=cut,
-            on_progress=on_progress,
-        ):
-            yield trained.agents, trained
+    Raises:
+        StudyError: the directory holds no run, its plan is damaged, somebody is at work in it, it needs its reward
+            function or was planned by other code.
+    """
+    path = Path(directory)
+    folder = RunFolder.open(path)
+    wanted = folder.facts["label"].get("reward_function")
+    if (wanted is None) != (reward is None):
+        say = f"was started with the reward function {wanted}; give it to um.resume_run" if wanted else "had none"
+        raise StudyError(f"{path}: reward: the run {say}")
+    if folder.complete:
+        shutil.rmtree(folder.shards_folder, ignore_errors=True)
+        return load_results(path)
+    if not other_code:
+        folder.check_code()
+    lease = Leases(folder.durability.lease_s).hold(folder.shards_folder, _HELP.format(path))
+    try:
+        for shard in folder.plan.shards:
+            folder.failure(shard).unlink(missing_ok=True)
+        return _run(path, Bench(folder.study, folder.plan, reward), workers, on_progress, on_event)
+    finally:
+        lease.release()
 
-    def finish(self, results: Results, place: slice, trained: TrainedBlock | None, seconds: dict[str, float]) -> None:
-        """Judge a block, trained or not, and add it to the results."""
-        members, keys = jax.tree.map(lambda leaf: leaf[place], (self.agents, self.keys))
-        rows = pd.DataFrame(identities(self.study)[place])
-        weights: dict[str, Any] = {}
-        curves: dict[str, Any] = {}
-        learned: dict[str, Judgement] = {}
-        distinct = Distinct.of(rows[[name for name in rows if name in _WHAT_IS_PLAYED]])
-        if "algorithm" in results.study.axes:
-            rows.insert(3, "algorithm", self.study.algorithm)
-        tick = time.perf_counter()
-        if self.algorithm and trained:
-            weights = {"best": trained.best, "last": trained.last}
-            names = ("chunk_steps", "episode_length", "look_steps", "validation")
-            curves = {name: getattr(trained, name) for name in names}
-            rows = rows.assign(
-                steps=self.steps,
-                diverged_at=trained.diverged_at,
-                best_step=trained.best_step,
-                best_validation=trained.best_score,
+
+def work_on(
+    directory: str | Path,
+    *,
+    wait: bool = True,
+    on_progress: OnProgress = lambda _: None,
+    on_event: OnEvent = lambda event, facts: None,
+) -> bool:
+    """Be one more worker of a run, until all of its shards are finished; tells whether they are.
+
+    The last one to finish puts the results together, unless somebody who started the run waits to do it.
+
+    Args:
+        directory: of the run, which hosts may share.
+        wait: for shards that others hold, to take over if they die.
+        on_progress: told after every chunk.
+        on_event: told ``(event, facts)`` of everything that is logged.
+
+    Raises:
+        StudyError: the directory holds no run, its plan is damaged, or it was planned by other code.
+        Stopped: a signal came; what this worker had is kept.
+    """
+    path = Path(directory)
+    with Stop() as stop:
+        worker = make_worker(path, stop=stop, on_progress=on_progress, on_event=on_event)
+        worker.folder.check_code()
+        try:
+            worker.work(wait=wait)
+        finally:
+            worker.log.close()
+        complete = all(state == "done" for _, state, _ in worker.folder.states())
+        if complete and (lease := worker.leases.claim(worker.folder.shards_folder)) is not None:
+            try:
+                if not worker.folder.complete:
+                    put_together(worker.folder)
+            finally:
+                lease.release()
+    return complete
+
+
+def _run(path: Path, bench: Bench, workers: int, on_progress: OnProgress, on_event: OnEvent) -> Results:
+    """Work until all shards are finished, and put the results together."""
+    with Stop() as stop:
+        worker = make_worker(path, bench=bench, stop=stop, on_progress=on_progress, on_event=on_event)
+        folder = worker.folder
+        stopped: KeyboardInterrupt | None = None
+        try:
+            while True:
+                if workers > 1:
+                    work_together(folder, workers, stop, on_progress, worker.log.tell)
+                else:
+                    worker.work()
+                if not (damaged := set_damaged_aside(folder, worker.log.tell)):
+                    break
+                worker.forget(damaged)
+        except KeyboardInterrupt as order:
+            stopped = order
+        finally:
+            worker.log.close()
+        if stopped is not None:
+            results = partial_results(folder)
+            results.run["stopped_by"] = getattr(stopped, "signal", 2)
+            return results
+        failed = [(shard, facts) for shard, state, facts in folder.states() if state == "failed"]
+        if failed:
+            shard, facts = failed[0]
+            raise StudyError(
+                f"{path}: {len(failed)} of {len(folder.plan.shards)} shards failed, shard {shard.number} with "
+                f"{facts.get('error', 'an unknown error')} ({folder.failure(shard)}); `uavmec resume {path}` tries them again"
             )
-            learned = judge_learned(self.algorithm, members, keys, weights)
-        columns, evaluation, planning = judge_all(members, keys, learned, distinct, self.study.evaluation)
-        seconds["plan"] += planning
-        seconds["evaluate"] += time.perf_counter() - tick - planning
-        results.add(self.study.algorithm, rows.assign(**columns), curves, evaluation, weights)
+        return put_together(folder)
 
 
-_WHAT_IS_PLAYED = ("seed", "powered", "connected", "place", *TRACED_PARAMS)
-"""Columns that say what an agent plays; all others say how it learns."""
+def _run_in_memory(study: Study, plan: Plan, bench: Bench, label: dict, on_progress: OnProgress) -> Results:
+    """Train and judge shard after shard in this process, keeping nothing."""
+    finished: list[Finished] = []
+    steps_before = 0
+    interrupted = False
+    try:
+        for shard in plan.shards:
+            of_steps = plan.total_steps or plan.agents
+            tick = time.perf_counter()
+            training = bench.start(shard)
+            while training is not None and not training.finished:
+                training.advance()
+                steps = steps_before + shard.agents * training.steps
+                on_progress(Progress(shard.number, steps, of_steps, training.mean_length))
+            finished.append(bench.finish(shard, training))
+            finished[-1].seconds["wall"] = time.perf_counter() - tick
+            steps_before += shard.agents * (plan.steps[shard.algorithm] or 1)
+            if training is None:
+                on_progress(Progress(shard.number, steps_before, of_steps, float("nan")))
+    except KeyboardInterrupt:
+        interrupted = True
+    results = Results.of(study, label, finished, plan.agents)
+    if interrupted:
+        results.run["stopped_by"] = 2
+    return results
 
 
 def _label(study: Study, plan: Plan, command: str | None) -> dict[str, Any]:
@@ -261,22 +292,7 @@ def _label(study: Study, plan: Plan, command: str | None) -> dict[str, Any]:
         "agents": plan.agents,
         "seeds": seeds_of(study),
         **({"places": places} if (places := describe_places(study)) else {}),
+        "workers": plan.workers,
         "blocks": {name: asdict(blocks) for name, blocks in plan.blocks.items()},
         **host.describe(),
     }
-
-
-def _measure(results: Results, plan: Plan, steps: int, seconds: dict[str, float], wall: float) -> None:
-    done = len(results.agents)
-    results.run |= {
-        "complete": done == plan.agents,
-        "agents_done": done,
-        "seconds": {name: round(spent, 2) for name, spent in seconds.items()} | {"wall": round(wall, 2)},
-    }
-    if steps:
-        results.run |= {
-            "diverged": int((results.agents["diverged_at"] >= 0).sum()),
-            "environment_steps": steps,
-            "training_steps_per_second": round(steps / seconds["train"]),
-            "validation_share": round(seconds["validate"] / (seconds["train"] + seconds["validate"]), 4),
-        }

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
-from uavmec_jax.learning.algorithm import AGENTS_AXIS
 from uavmec_jax.learning.blocks import plan_blocks
-from uavmec_jax.learning.population import Programs, on_devices
+from uavmec_jax.learning.population import take
+from uavmec_jax.learning.programs import Programs, make_mesh, on_devices
 from uavmec_jax.studies import host
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.studies.study import make_agents, make_algorithm, n_agents, validation_keys
@@ -88,14 +88,14 @@ def training_speed(
     algorithm, n = make_algorithm(study), n_agents(study)
     assert algorithm is not None
     blocks = plan_blocks(n, algorithm.agent_bytes, host.free_memory())
-    mesh = Mesh(np.array(jax.local_devices()[: blocks.devices]), (AGENTS_AXIS,))
+    mesh = make_mesh(blocks.devices)
     everyone = (make_agents(study), validation_keys(study))
     tick = time.perf_counter()
-    programs = Programs.compile(algorithm, mesh, on_devices(mesh, *everyone, 0, blocks.size))
+    programs = Programs.compile(algorithm, mesh, take(everyone, 0, blocks.size))
     compile_seconds = time.perf_counter() - tick
     chunk, rates = max(1, 1000 // algorithm.steps_per_iteration), []
     for block in range(blocks.count):
-        agents, _ = on_devices(mesh, *everyone, block * blocks.size, blocks.size)
+        agents, _ = on_devices(mesh, take(everyone, block * blocks.size, blocks.size))
         state = prepare(programs.update(agents, programs.init(agents), np.int32(0), np.int32(warm_up)))
         first = warm_up if start is None else start
 

@@ -4,6 +4,7 @@ import itertools
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -179,8 +180,12 @@ def make_algorithm(study: Study) -> Algorithm | None:
     )
 
 
-def make_agents(study: Study, reward: Reward | None = None) -> Agent:
-    """The population of a study of one algorithm, leaves ``[A, ...]``, in the order of :func:`identities`.
+Who = list[dict[str, Any]]
+"""Agents by their identities."""
+
+
+def make_agents(study: Study, reward: Reward | None = None, who: Who | None = None) -> Agent:
+    """Agents of a study of one algorithm, leaves ``[A, ...]``; by default all, in the order of :func:`identities`.
 
     What is random about an agent hangs on its seed and its counts of devices alone: layouts on the seed (the cells of
     one seed are the same town with less and less power and communication), exploration and weights on all three.
@@ -189,8 +194,9 @@ def make_agents(study: Study, reward: Reward | None = None) -> Agent:
     Args:
         study: of one algorithm, or of none.
         reward: stands in for the study's reward, for all agents.
+        who: some of the study's identities.
     """
-    who = identities(study)
+    who = identities(study) if who is None else who
     seeds, powered, connected = (_column(who, name) for name in ("seed", "powered", "connected"))
 
     def leaf(name: str, default: Any) -> Any:
@@ -204,7 +210,7 @@ def make_agents(study: Study, reward: Reward | None = None) -> Agent:
 
     settings: dict[str, Any] = {name: spread(name, value) for name, value in study.params.model_dump().items()}
     params = Params(**settings)
-    layout = onto_places(jax.jit(jax.vmap(town))(seeds, params, powered, connected), who, study)
+    layout = onto_places(_towns(seeds, params, powered, connected), who, study)
     rewards = [_reward_of(study, agent, reward) for agent in who]
     declared = ALGORITHMS["dqn" if study.algorithm == "none" else study.algorithm]
     own = getattr(study, "dqn" if study.algorithm == "none" else study.algorithm)
@@ -230,28 +236,36 @@ def town(seed: Any, params: Params, n_powered: Any, n_connected: Any) -> Layout:
     return sample_layout(jax.random.fold_in(jax.random.key(_LAYOUT), seed), params, n_powered, n_connected)
 
 
+_towns = jax.jit(jax.vmap(town))
+
+
 def held_out_draws(seed: int, powered: int, connected: int, draws: int) -> Any:
     """``[draws]`` volume draws: the first ones that a study judges policies on in this cell and for this seed."""
     numbers = np.array([[seed], [powered], [connected]], np.int32)
     return jax.random.split(_agent_keys(_HELD_OUT, *numbers)[0], draws)
 
 
-def validation_keys(study: Study) -> Any:
-    """``[A, validation_draws]`` volume draws for the looks during training."""
-    return _draw_keys(study, _VALIDATION, study.evaluation.validation_draws)
+def validation_keys(study: Study, who: Who | None = None) -> Any:
+    """``[A, validation_draws]`` volume draws for the looks during training; by default of all agents."""
+    return _draw_keys(study, _VALIDATION, study.evaluation.validation_draws, who)
 
 
-def evaluation_keys(study: Study) -> Any:
+def evaluation_keys(study: Study, who: Who | None = None) -> Any:
     """``[A, draws + 1]`` volume draws for the tables; the last one is the fixed draw, the same for every agent."""
-    held_out = _draw_keys(study, _HELD_OUT, study.evaluation.draws)
+    held_out = _draw_keys(study, _HELD_OUT, study.evaluation.draws, who)
     fixed = jnp.broadcast_to(jax.random.key(_FIXED), (held_out.shape[0], 1))
     return jnp.concatenate([held_out, fixed], axis=1)
 
 
-def _draw_keys(study: Study, stream: int, draws: int) -> Any:
-    who = identities(study)
+def _draw_keys(study: Study, stream: int, draws: int, who: Who | None) -> Any:
+    who = identities(study) if who is None else who
     keys = _agent_keys(stream, *(_column(who, name) for name in ("seed", "powered", "connected")))
-    return jax.jit(jax.vmap(lambda key: jax.random.split(key, draws)))(keys)
+    return _split(keys, draws)
+
+
+@partial(jax.jit, static_argnames="n")
+def _split(keys: Any, n: int) -> Any:
+    return jax.vmap(lambda key: jax.random.split(key, n))(keys)
 
 
 @jax.jit
@@ -265,5 +279,5 @@ def _agent_keys(stream: int, *numbers: Any) -> Any:
     return jax.vmap(_fold, (None, *(0 for _ in numbers)))(jax.random.key(stream), *numbers)
 
 
-def _column(who: list[dict[str, Any]], name: str) -> np.ndarray:
+def _column(who: Who, name: str) -> np.ndarray:
     return np.array([agent[name] for agent in who], np.int32)

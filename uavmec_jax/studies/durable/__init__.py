@@ -1,0 +1,1 @@
+"""Runs that survive: shards, leases, snapshots, workers, status."""

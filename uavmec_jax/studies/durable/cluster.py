@@ -1,0 +1,49 @@
+"""Workers on a cluster, started by submitit; what they do is what `uavmec worker` does."""
+
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from uavmec_jax.errors import StudyError
+
+
+def submit_workers(prepare: Callable[[], Path], jobs: int, executor: str, parameters: Mapping[str, Any]) -> list[str]:
+    """Submit workers as one array of jobs, and return their names.
+
+    Args:
+        prepare: plans the run and returns its folder; called once submitit is known to be able to submit.
+        jobs: workers.
+        executor: of submitit: ``slurm``, ``local``, ``debug``.
+        parameters: for ``AutoExecutor.update_parameters``, e.g. ``timeout_min``, ``cpus_per_task``, ``slurm_partition``.
+
+    Raises:
+        StudyError: submitit is not installed, or knows no such executor or parameter.
+    """
+    try:
+        import submitit
+    except ImportError:
+        raise StudyError(
+            "submit needs the package submitit, which is not installed: pip install 'uavmec-jax[cluster]'"
+        ) from None
+    try:
+        submitit.AutoExecutor(folder=tempfile.gettempdir(), cluster=executor)
+    except (RuntimeError, ValueError) as error:
+        raise StudyError(f"--executor {executor}: {error}") from None
+    directory = prepare()
+    queue = submitit.AutoExecutor(folder=directory / "log" / "jobs", cluster=executor)
+    try:
+        queue.update_parameters(name="uavmec", **parameters)
+    except (NameError, TypeError, AssertionError) as error:
+        raise StudyError(f"--with: {error}") from None
+    return [job.job_id for job in queue.map_array(_work, [str(directory)] * jobs)]
+
+
+def _work(directory: str) -> bool:
+    """What runs on a node: one worker with the cores that the scheduler gave it."""
+    from uavmec_jax.studies import host
+
+    host.use_every_core()
+    from uavmec_jax.studies.run import work_on
+
+    return work_on(directory)
