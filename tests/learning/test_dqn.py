@@ -184,7 +184,14 @@ def test_batched_agent_is_the_agent_alone():
 
 
 @pytest.mark.parametrize(
-    "bad", [{"learning_rate": np.inf}, {"learning_rate": np.nan}, {"gamma": np.nan}, {"learning_rate": 1e35}]
+    "bad",
+    [
+        {"learning_rate": np.inf},
+        {"learning_rate": np.nan},
+        {"gamma": np.nan},
+        {"learning_rate": 1e30},
+        {"learning_rate": 1e35},
+    ],
 )
 def test_diverged_agent_is_frozen_marked_and_touches_nobody(bad):
     sound = [make_agent(0), make_agent(1), make_agent(2)]

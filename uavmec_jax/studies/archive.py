@@ -19,16 +19,16 @@ from uavmec_jax.studies.shard import Finished
 from uavmec_jax.studies.study import cell_axes, load_study
 
 
-def put_together(folder: RunFolder) -> Results:
+def put_together(folder: RunFolder, **more: Any) -> Results:
     """The results of a run whose shards are all finished; the shards' own files are then no longer needed.
 
-    However often and by whomever it is done, the files are the same.
+    However often and by whomever it is done, the files are the same. ``more`` is added to the run's label.
 
     Raises:
         StudyError: a shard is not finished, or its file is damaged.
     """
     shards = [Finished.read(folder.result(shard)) for shard in folder.plan.shards]
-    results = Results.of(folder.study, folder.facts["label"], shards, folder.plan.agents)
+    results = Results.of(folder.study, folder.facts["label"] | more, shards, folder.plan.agents)
     _check_agents(folder, results)
     results.save(folder.path)
     shutil.rmtree(folder.shards_folder, ignore_errors=True)

@@ -147,6 +147,36 @@ class Results:
             rows.append(row)
         return pd.DataFrame(rows)
 
+    def curve_table(self) -> pd.DataFrame:
+        """Every curve as a tidy table: the agent's axes, ``steps``, ``curve`` (``episode_length``, ``validation``), ``value``."""
+        tables = []
+        for name, curves in self.curves.items():
+            who = self._who(self.agents["algorithm"] == name if "algorithm" in self.agents else slice(None))
+            for curve, steps in (("episode_length", "chunk_steps"), ("validation", "look_steps")):
+                n = len(curves[steps])
+                table = who.loc[who.index.repeat(n)].reset_index(drop=True)
+                tables.append(
+                    table.assign(steps=np.tile(curves[steps], len(who)), curve=curve, value=curves[curve].ravel())
+                )
+        return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
+
+    def episode_table(self) -> pd.DataFrame:
+        """Every episode of the evaluation as a tidy table: the agent's axes, ``policy``, ``draw``, ``fixed``, ``lifetime``."""
+        who, tables = self._who(slice(None)), []
+        for name, lives in self.evaluation.items():
+            policy, _, what = name.partition("/")
+            if what != "lifetime":
+                continue
+            draw = np.tile(np.arange(lives.shape[1]), len(who))
+            table = who.loc[who.index.repeat(lives.shape[1])].reset_index(drop=True)
+            fixed = (draw == lives.shape[1] - 1) & (policy not in PLANNERS)
+            tables.append(table.assign(policy=policy, draw=draw, fixed=fixed, lifetime=lives.ravel()))
+        return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
+
+    def _who(self, which: Any) -> pd.DataFrame:
+        """The axes of some agents."""
+        return self.agents.loc[which, ["seed", *cell_axes(self.study)]].reset_index(drop=True)
+
     def first_failures(self, policy: str) -> np.ndarray:
         """``[A, n]`` how often each device of each agent's layout is the first to fail, over the held-out draws.
 

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from uavmec_jax.errors import StudyError
@@ -178,7 +179,8 @@ def resume_run(
     try:
         for shard in folder.plan.shards:
             folder.failure(shard).unlink(missing_ok=True)
-        return _run(path, Bench(folder.study, folder.plan, reward), workers, on_progress, on_event)
+        label = {"other_code": differ} if (differ := folder.other_code()) else {}
+        return _run(path, Bench(folder.study, folder.plan, reward), workers, on_progress, on_event, label)
     finally:
         lease.release()
 
@@ -222,7 +224,14 @@ def work_on(
     return complete
 
 
-def _run(path: Path, bench: Bench, workers: int, on_progress: OnProgress, on_event: OnEvent) -> Results:
+def _run(
+    path: Path,
+    bench: Bench,
+    workers: int,
+    on_progress: OnProgress,
+    on_event: OnEvent,
+    label: Mapping[str, Any] = MappingProxyType({}),
+) -> Results:
     """Work until all shards are finished, and put the results together."""
     with Stop() as stop:
         worker = make_worker(path, bench=bench, stop=stop, on_progress=on_progress, on_event=on_event)
@@ -252,7 +261,7 @@ def _run(path: Path, bench: Bench, workers: int, on_progress: OnProgress, on_eve
                 f"{path}: {len(failed)} of {len(folder.plan.shards)} shards failed, shard {shard.number} with "
                 f"{facts.get('error', 'an unknown error')} ({folder.failure(shard)}); `uavmec resume {path}` tries them again"
             )
-        return put_together(folder)
+        return put_together(folder, **label)
 
 
 def _run_in_memory(study: Study, plan: Plan, bench: Bench, label: dict, on_progress: OnProgress) -> Results:

@@ -119,17 +119,19 @@ class RunFolder:
         """What everything in the folder must be of."""
         return str(self.facts["sha256"])
 
+    def other_code(self) -> list[str]:
+        """How code and libraries differ from those that planned the run; empty if they do not."""
+        now = {"uavmec_jax's code": host.code_digest()} | host.versions()
+        then = {"uavmec_jax's code": self.facts["code_sha256"]} | self.facts["versions"]
+        return [f"{name} {then.get(name, '?')[:12]} -> {now[name][:12]}" for name in now if now[name] != then.get(name)]
+
     def check_code(self) -> None:
         """Bits are only the same from the same code.
 
         Raises:
             StudyError: the run was planned by other code or other versions of the libraries.
         """
-        now = {"uavmec_jax's code": host.code_digest()} | host.versions()
-        then = {"uavmec_jax's code": self.facts["code_sha256"]} | self.facts["versions"]
-        changed = [name for name in now if now[name] != then.get(name)]
-        differ = [f"{name} {then.get(name, '?')[:12]} -> {now[name][:12]}" for name in changed]
-        if changed:
+        if differ := self.other_code():
             raise StudyError(
                 f"{self.path}: was planned by other code ({', '.join(differ)}), with which its bits would be others; "
                 "resume it with that code, or say --other-code"

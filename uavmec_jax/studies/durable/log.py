@@ -5,6 +5,7 @@ import os
 import socket
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -31,13 +32,16 @@ class Log:
     def tell(self, event: str, **facts: Any) -> None:
         """One event."""
         if self._folder is not None:
-            if self._file is None:
-                self._folder.mkdir(parents=True, exist_ok=True)
-                name = f"{socket.gethostname()}-{os.getpid()}.jsonl"
-                self._file = (self._folder / name).open("a", encoding="utf-8")
-            self._file.write(json.dumps({"event": event, "at": round(time.time(), 3)} | facts) + "\n")
-            self._file.flush()
+            with suppress(OSError):  # a full disk: what counts is the snapshot, and there it is told
+                self._append(json.dumps({"event": event, "at": round(time.time(), 3)} | facts) + "\n")
         self._on_event(event, facts)
+
+    def _append(self, line: str) -> None:
+        if self._file is None:
+            assert self._folder is not None
+            self._folder.mkdir(parents=True, exist_ok=True)
+            self._file = (self._folder / f"{socket.gethostname()}-{os.getpid()}.jsonl").open("ab", buffering=0)
+        self._file.write(line.encode())
 
     def curve(self, shard: int, steps: int, **values: float) -> None:
         """Points of a shard's curves, at a number of environment steps of one agent."""

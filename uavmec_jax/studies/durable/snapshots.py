@@ -69,7 +69,7 @@ class Snapshots:
             OSError: it cannot be written; those before it are as they were.
         """
         tick = time.monotonic()
-        path = self._path(training.done)
+        path = self._next_path()
         if self.kind == "weights":
             write_collection(path, self.collection(training.weights(self.facts["agents"])))
         else:
@@ -110,8 +110,9 @@ class Snapshots:
         for path in [*self._generations(), *self.folder.glob("snapshot-*.damaged")]:
             path.unlink(missing_ok=True)
 
-    def _path(self, done: int) -> Path:
-        return self.folder / f"snapshot-{done:08d}.npz"
+    def _next_path(self) -> Path:
+        numbers = [int(path.stem.removeprefix("snapshot-")) for path in self.folder.glob("snapshot-[0-9]*.*")]
+        return self.folder / f"snapshot-{max(numbers, default=0) + 1:06d}.npz"
 
     def _generations(self) -> list[Path]:
         """The newest first."""

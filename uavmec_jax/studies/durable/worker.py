@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from uavmec_jax.errors import UserError
+from uavmec_jax.errors import StudyError
 from uavmec_jax.files import write_text
 from uavmec_jax.learning.population import Progress
 from uavmec_jax.learning.training import Training
@@ -51,7 +51,7 @@ class Worker:
 
         Raises:
             Stopped: a signal came; the shard at hand is kept as it is.
-            OSError: something could not be written.
+            StudyError: something could not be written.
         """
         while True:
             found = self._claim()
@@ -104,10 +104,13 @@ class Worker:
         except LeaseLostError as error:
             self.log.tell("lost", shard=shard.number, error=str(error))
             return  # and leave the lease alone: it is somebody else's
-        except (OSError, UserError, MemoryError) as error:  # the machine's fault: another one may do better
+        except (OSError, MemoryError) as error:  # the machine's fault: another one may do better
             self.log.tell("stopped", shard=shard.number, error=str(error))
             lease.release()
-            raise
+            raise StudyError(
+                f"{self.folder.shard_folder(shard)}: cannot be written: {getattr(error, 'strerror', None) or error}; what "
+                f"was kept before is whole; when there is room, go on with: uavmec resume {self.folder.path}"
+            ) from error
         except Exception as error:
             facts = {"error": f"{type(error).__name__}: {error}", "traceback": traceback.format_exc()}
             write_text(self.folder.failure(shard), json.dumps(facts, indent=1) + "\n")

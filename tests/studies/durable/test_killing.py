@@ -1,0 +1,117 @@
+"""Runs that are killed, stopped, interrupted, and that run out of disk: they go on and end with the same bits."""
+
+import random
+import resource
+import signal
+import time
+
+import pytest
+
+from tests.studies.durable.runs import TINY, bits, events, start, uavmec
+
+pytestmark = pytest.mark.slow
+
+KILLS = 20
+
+TRAINED_LONG = ["--set", "steps=150000", "--shard-size", "2", "--snapshot-every", "0"]
+"""Two shards of a few seconds, with snapshots as often as they are cheap."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("killing")
+    (folder / "tiny.toml").write_text(TINY)
+    uavmec("run", "tiny.toml", *TRAINED_LONG, "--out", "whole", cwd=folder)
+    return folder
+
+
+def test_the_uninterrupted_run_keeps_snapshots_cheaply(folder):
+    import json
+
+    run = json.loads((folder / "whole" / "run.json").read_text())
+    assert run["snapshot_share"] < 0.03
+    assert len(events(folder / "whole", "snapshot")) > 4
+    assert not (folder / "whole" / "shards").exists()
+
+
+def test_killed_twenty_times_it_ends_with_the_same_bits(folder):
+    """SIGKILL at random moments: while it starts, trains, writes a snapshot, judges, puts the results together."""
+    moments = random.Random(5)
+    kills, runs = 0, 0
+    while kills < KILLS:
+        runs += 1
+        out = f"killed-{runs}"
+        arguments = ["run", "tiny.toml", *TRAINED_LONG, "--out", out]
+        while True:
+            process = start(*arguments, cwd=folder)
+            if kills < KILLS:
+                time.sleep(moments.uniform(1.0, 8.0))
+                if process.poll() is None:
+                    process.kill()
+                    kills += 1
+            _, errors = process.communicate(timeout=120)
+            if (folder / out / "plan.json").exists():
+                arguments = ["resume", out]
+            if process.returncode != -signal.SIGKILL:
+                assert process.returncode == 0, errors
+                break
+        assert bits(folder / out) == bits(folder / "whole"), f"after {kills} kills"
+        assert not (folder / out / "shards").exists()
+    assert any(events(folder / f"killed-{k + 1}", "restored") for k in range(runs))
+
+
+@pytest.mark.parametrize(("order", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_told_to_stop_it_keeps_all_and_says_how_to_go_on(folder, order, code):
+    out = f"stopped-{code}"
+    process = start("run", "tiny.toml", *TRAINED_LONG, "--snapshot-every", "3600", "--out", out, cwd=folder)
+    wait_for(lambda: len(events(folder / out, "chunk")) > 20, process)
+    process.send_signal(order)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == code
+    assert f"go on with: uavmec resume {out}" in errors
+    (kept,) = events(folder / out, "snapshot")
+    assert events(folder / out, "chunk")[-1]["steps"] == kept["steps"]
+    uavmec("resume", out, cwd=folder)
+    (restored,) = events(folder / out, "restored")
+    assert restored["steps"] == kept["steps"]
+    assert bits(folder / out) == bits(folder / "whole")
+
+
+def test_weights_snapshots_are_policies_and_the_shard_starts_again(folder):
+    process = start("run", "tiny.toml", *TRAINED_LONG, "--snapshot", "weights", "--out", "light", cwd=folder)
+    wait_for(lambda: len(events(folder / "light", "snapshot")) > 1, process)
+    process.send_signal(signal.SIGTERM)
+    process.communicate(timeout=60)
+    (first, second) = sorted((folder / "light" / "shards" / "00000").glob("snapshot-*.npz"))
+    assert first.stat().st_size < 200_000
+    axes = ["--agent", "seed=0", "--agent", "powered=12", "--draws", "2"]
+    assert "lifetime" in uavmec("evaluate", second, "--seed", 0, *axes, cwd=folder).stdout.lower()
+    uavmec("resume", "light", cwd=folder)
+    assert not events(folder / "light", "restored")
+    assert bits(folder / "light") == bits(folder / "whole")
+
+
+def test_a_full_disk_is_said_and_the_snapshot_before_is_used(folder):
+    """A limit on the size of files stands in for it: the log and small files fit, a snapshot does not."""
+    out = "full"
+    process = start("run", "tiny.toml", *TRAINED_LONG, "--out", out, cwd=folder)
+    wait_for(lambda: len(events(folder / out, "snapshot")) > 1, process)
+    size = events(folder / out, "snapshot")[0]["bytes"]
+    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (size // 2, size // 2))
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert "File too large" in errors
+    assert "uavmec resume full" in errors
+    names = {file.name for file in (folder / out / "shards" / "00000").iterdir()}
+    assert not any(".part" in name for name in names)
+    uavmec("resume", out, cwd=folder)
+    assert events(folder / out, "restored")
+    assert bits(folder / out) == bits(folder / "whole")
+
+
+def wait_for(condition, process, seconds=60):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline, "took too long"
+        time.sleep(0.05)
