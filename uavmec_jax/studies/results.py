@@ -148,7 +148,7 @@ class Results:
         return pd.DataFrame(rows)
 
     def curve_table(self) -> pd.DataFrame:
-        """Every curve as a tidy table: the agent's axes, ``steps``, ``curve`` (``episode_length``, ``validation``), ``value``."""
+        """Tidy: the agent's axes, ``steps``, ``curve`` (``episode_length`` or ``validation``), ``value``."""
         tables = []
         for name, curves in self.curves.items():
             who = self._who(self.agents["algorithm"] == name if "algorithm" in self.agents else slice(None))
@@ -161,7 +161,7 @@ class Results:
         return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
     def episode_table(self) -> pd.DataFrame:
-        """Every episode of the evaluation as a tidy table: the agent's axes, ``policy``, ``draw``, ``fixed``, ``lifetime``."""
+        """Tidy: the agent's axes, ``policy``, ``draw``, whether it is the ``fixed`` one, ``lifetime`` in slots."""
         who, tables = self._who(slice(None)), []
         for name, lives in self.evaluation.items():
             policy, _, what = name.partition("/")

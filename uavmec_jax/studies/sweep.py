@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
-from jaxtyping import Key
+from jaxtyping import PRNGKeyArray
 
 from uavmec_jax.errors import StudyError
 from uavmec_jax.learning import population
@@ -75,7 +75,7 @@ def train(
     algorithm: str,
     scenarios: Scenario,
     *,
-    key: Key,
+    key: PRNGKeyArray,
     steps: int,
     hyper: Mapping[str, Any] | None = None,
     settings: Mapping[str, Any] | None = None,
