@@ -8,6 +8,7 @@ from uavmec_jax.cli.common import fail
 from uavmec_jax.cli.machine import doctor
 from uavmec_jax.cli.runs import resume, status, submit, worker
 from uavmec_jax.cli.scenarios import evaluate, plan
+from uavmec_jax.cli.search import search
 from uavmec_jax.cli.studies import compare, run, show, validate
 from uavmec_jax.cli.traffic import traffic
 from uavmec_jax.errors import UserError
@@ -36,6 +37,7 @@ def main() -> None:
     uavmec run my-study.toml      a study of your own
     uavmec resume runs/...        go on with one that was stopped or killed
     uavmec status runs/...        how far it is
+    uavmec search dqn             better settings: trials by the batch, each batch one program
     uavmec plan my-town.toml      tours for your own devices, what fails first, what to repair
     uavmec show runs/...          the tables of a run again
     uavmec traffic show albany    an evacuation, and which devices see it
@@ -44,7 +46,7 @@ def main() -> None:
     """
 
 
-_COMMANDS = (run, resume, status, worker, submit, plan, evaluate, show, compare, validate, traffic, doctor)
+_COMMANDS = (run, resume, status, worker, submit, search, plan, evaluate, show, compare, validate, traffic, doctor)
 
 for _command in _COMMANDS:
     main.add_command(_command)

@@ -106,7 +106,7 @@ class Trainer:
             here = slice(first, first + size)
             members, draws = on_devices(self.mesh, jax.tree.map(lambda leaf, here=here: leaf[here], (agents, keys)))
             state = self.programs.init(members)
-            waves.append(_Wave(members, draws, state, no_best_yet(state)))
+            waves.append(Wave(members, draws, state, no_best_yet(state)))
         return Training(self, waves)
 
     @cached_property
@@ -122,7 +122,7 @@ class Trainer:
 
 
 @dataclass
-class _Wave:
+class Wave:
     """As many groups of a block as there are devices: they train at the same time."""
 
     agents: Agent
@@ -146,7 +146,7 @@ class Training:
     """
 
     trainer: Trainer
-    waves: list[_Wave]
+    waves: list[Wave]
     done: int = 0
     sound: bool = True
     slots: list[np.ndarray] = field(default_factory=list)
@@ -174,6 +174,11 @@ class Training:
         """Mean length of the training episodes that ended in the last chunk, slots."""
         return float(self.slots[-1].sum() / max(self.episodes[-1].sum(), 1))
 
+    @property
+    def best_scores(self) -> np.ndarray:
+        """``[B]`` score of the best look so far."""
+        return joined(wave.best.score for wave in self.waves)
+
     def advance(self) -> None:
         """Train one more chunk, and look if it is time to."""
         first, last, is_look = self.trainer.chunks[self.done]
@@ -181,8 +186,8 @@ class Training:
         tick, self.sound = time.perf_counter(), False
         for wave in self.waves:
             wave.state = programs.update(wave.agents, wave.state, np.int32(first), np.int32(last))
-        self.slots.append(_joined(wave.state.episode_slots for wave in self.waves))
-        self.episodes.append(_joined(wave.state.episodes for wave in self.waves))
+        self.slots.append(joined(wave.state.episode_slots for wave in self.waves))
+        self.episodes.append(joined(wave.state.episodes for wave in self.waves))
         self.seconds["train"] += time.perf_counter() - tick
         self.done += 1
         if is_look:
@@ -193,7 +198,7 @@ class Training:
                     wave.agents, wave.keys, wave.state.weights, wave.best, np.int32(self.steps)
                 )
                 scores.append(score)
-            self.scores.append(_joined(scores))
+            self.scores.append(joined(scores))
             self.seconds["validate"] += time.perf_counter() - tick
         self.sound = True
 
@@ -265,11 +270,11 @@ class Training:
         )
 
 
-def _joined(pieces: Any) -> np.ndarray:
+def joined(pieces: Any) -> np.ndarray:
     """``[B]`` from the waves' parts."""
     return np.concatenate([np.asarray(piece) for piece in pieces])
 
 
 def _kept(trees: list[Any], real: int) -> Any:
     """Leaves of the waves as one, on the host, without padding."""
-    return jax.tree.map(lambda *leaves: _joined(leaves)[:real], *trees)
+    return jax.tree.map(lambda *leaves: joined(leaves)[:real], *trees)

@@ -1,0 +1,1 @@
+"""Hyperparameter search: batches of trials, each batch one population."""
