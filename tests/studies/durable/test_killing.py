@@ -1,13 +1,17 @@
 """Runs that are killed, stopped, interrupted, and that run out of disk: they go on and end with the same bits."""
 
+import json
 import random
 import resource
 import signal
 import time
 
+import pandas as pd
 import pytest
 
 from tests.studies.durable.runs import TINY, bits, events, start, uavmec
+from uavmec_jax.studies.run import prepare_run
+from uavmec_jax.studies.study import load_study
 
 pytestmark = pytest.mark.slow
 
@@ -26,8 +30,6 @@ def folder(tmp_path_factory):
 
 
 def test_the_uninterrupted_run_keeps_snapshots_cheaply(folder):
-    import json
-
     run = json.loads((folder / "whole" / "run.json").read_text())
     assert run["snapshot_share"] < 0.03
     assert len(events(folder / "whole", "snapshot")) > 4
@@ -89,6 +91,55 @@ def test_weights_snapshots_are_policies_and_the_shard_starts_again(folder):
     uavmec("resume", "light", cwd=folder)
     assert not events(folder / "light", "restored")
     assert bits(folder / "light") == bits(folder / "whole")
+
+
+def test_a_workers_shard_is_finished_by_another(folder):
+    """Two workers with one core each, on a run planned for two: the same bits as on both cores in one process."""
+    prepare_run(load_study(folder / "tiny.toml", {"steps": 150_000}), folder / "team", shard_size=2)
+    team = [start("worker", "team", "--share", f"{k}/2", cwd=folder) for k in (1, 2)]
+    wait_for(lambda: len(events(folder / "team", "chunk")) > 40, team[0])
+    wait_for(lambda: len(events(folder / "team", "claimed")) == 2, team[1])
+    victim = team[0]
+    victim.kill()
+    victim.communicate()
+    output, errors = team[1].communicate(timeout=120)
+    assert team[1].returncode == 0, errors
+    assert "complete" in output
+    claims = events(folder / "team", "claimed")
+    assert [told["taken_over"] for told in claims].count(True) == 1
+    assert sorted(told["shard"] for told in events(folder / "team", "done")) == [0, 1]
+    assert bits(folder / "team") == bits(folder / "whole")
+
+
+def test_workers_of_one_command(folder):
+    process = start("run", "tiny.toml", *TRAINED_LONG, "--workers", "2", "--out", "two", cwd=folder)
+    wait_for(lambda: len(events(folder / "two", "claimed")) == 2, process)
+    told = json.loads(uavmec("status", "two", "--json", cwd=folder).stdout)
+    assert told["shards"]["running"] == 2
+    assert len(told["workers"]) == 2
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 143, errors
+    said = uavmec("status", "two", cwd=folder).stdout
+    assert "2 stopped" in said
+    assert "nobody is at work; go on with: uavmec resume two" in said
+    uavmec("resume", "two", "--workers", "2", cwd=folder)
+    assert len(pd.read_csv(folder / "two" / "agents.csv")) == 4
+    assert "complete" in uavmec("status", "two", cwd=folder).stdout
+
+
+def test_workers_of_a_cluster(folder):
+    """submitit's executor for this machine stands in for SLURM's."""
+    options = ["--jobs", "2", "--executor", "local", "--set", "steps=4000", "--with", "timeout_min=5"]
+    said = uavmec("submit", "tiny.toml", *options, "--out", "jobs", cwd=folder).stdout
+    assert "2 workers submitted" in said
+    deadline = time.monotonic() + 120
+    while not json.loads(uavmec("status", "jobs", "--json", cwd=folder).stdout)["complete"]:
+        assert time.monotonic() < deadline
+    assert len(pd.read_csv(folder / "jobs" / "agents.csv")) == 4
+    wrong = uavmec("submit", "tiny.toml", "--jobs", "1", "--executor", "slum", cwd=folder, check=False)
+    assert (wrong.returncode, wrong.stderr.count("\n")) == (2, 1)
+    assert "--executor slum" in wrong.stderr
 
 
 def test_a_full_disk_is_said_and_the_snapshot_before_is_used(folder):

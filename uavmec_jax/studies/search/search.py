@@ -19,6 +19,7 @@ from uavmec_jax.studies.search.space import (
     Range,
     Space,
     digest,
+    holds,
     outer,
     own_settings,
     settings_of,
@@ -154,7 +155,7 @@ def _tupled(space: dict[str, Any]) -> dict[str, Any]:
 
 
 def _open(optuna: Any, path: Path, space: Space) -> "optuna.Study":
-    """The search's database; its first trial has the study's own settings."""
+    """The search's database; its first trial has the study's own settings, as far as they lie in the space."""
     from sqlalchemy import URL
     from sqlalchemy.exc import DatabaseError
 
@@ -165,7 +166,8 @@ def _open(optuna: Any, path: Path, space: Space) -> "optuna.Study":
     except DatabaseError as error:
         raise StudyError(f"{path / DATABASE}: cannot be read: {error.orig!s}") from None
     if not trials.get_trials(deepcopy=False):
-        trials.enqueue_trial({key: _told(value) for key, value in own_settings(space).items()})
+        own = own_settings(space)
+        trials.enqueue_trial({key: _told(own[key]) for key, values in space.space.items() if holds(values, own[key])})
     return trials
 
 

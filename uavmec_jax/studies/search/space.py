@@ -180,6 +180,11 @@ def values_at_the_edge(values: Range | Choices) -> list[Any]:
     return values.choices if isinstance(values, Choices) else [values.low, values.high]
 
 
+def holds(values: Range | Choices, value: Any) -> bool:
+    """Whether a value is one of those that are searched."""
+    return value in values.choices if isinstance(values, Choices) else values.low <= value <= values.high
+
+
 def outer(space: Space) -> list[str]:
     """What shapes the program: the same for all trials of a batch."""
     declared = ALGORITHMS[space.base().algorithms[0]]
