@@ -70,3 +70,21 @@ def test_table7_evacuation(tmp_path):
     assert (tmp_path / "table7" / "figure.png").exists()
     pictures = {file.name for file in (tmp_path / "table7-pictures").iterdir()}
     assert pictures == {"round_lake.png", "round_lake.gif", "albany.png", "albany.gif"}
+
+
+def test_benchmark_accelerator(tmp_path):
+    """Started again it reads the run that it has made."""
+    for _ in range(2):
+        out = run("benchmark_accelerator.py", "--quick", "--seconds", 0.2, "--out", tmp_path)
+        assert "table5: 25 agents" in out
+    report = json.loads((tmp_path / "throughput.json").read_text())
+    assert [row["layouts"] for row in report["environment"]] == [1000]
+    assert report["training"][0]["steps_per_second"] > 0
+
+
+def test_simulation_against_a_run(tmp_path):
+    options = ["--study", "planning", "--set", "axes.seeds=1", "--set", "evaluation.draws=2"]
+    out = run("simulation_against_a_run.py", *options, "--out", tmp_path / "run")
+    assert "wall time" in out
+    report = json.loads((tmp_path / "run" / "simulation.json").read_text())
+    assert set(report["measured"]) == {"wall_s", "disk_bytes", "memory_bytes"}

@@ -13,7 +13,7 @@ from uavmec_jax.reporting import canvas, figures, tables
 from uavmec_jax.studies import host
 from uavmec_jax.studies.archive import load_results, load_weights
 from uavmec_jax.studies.plan import BYTES_WITHOUT_TRAINING, plan_study
-from uavmec_jax.studies.run import check_directory, run_study
+from uavmec_jax.studies.run import check_directory, resume_run, run_study
 from uavmec_jax.studies.study import parse_study
 
 TOML = """
@@ -281,10 +281,18 @@ def test_a_run_of_schema_1_can_be_read(finished, tmp_path):
     assert_array_equal(again.curves["dqn"]["validation"], finished[0].curves["dqn"]["validation"])
 
 
-def test_same_study_twice_is_equal_to_the_bit(finished):
-    results, _ = finished
-    again = run_study(results.study)
-    for name, leaf in results.weights.items():
-        assert_array_equal(leaf, again.weights[name])
-    assert_array_equal(results.curves["dqn"]["episode_length"], again.curves["dqn"]["episode_length"])
-    assert np.isfinite(results.agents["best_lifetime"]).all()
+def test_stopped_and_resumed_it_is_equal_to_the_bit(finished, tmp_path):
+    results, directory = finished
+
+    def stop(news):
+        if news.steps >= 8 * 300:
+            raise KeyboardInterrupt
+
+    half = run_study(results.study, tmp_path / "half", on_progress=stop)
+    assert (half.run["complete"], half.run["stopped_by"], len(half.agents)) == (False, 2, 0)
+    told = []
+    again = resume_run(tmp_path / "half", on_event=lambda event, facts: told.append((event, facts)))
+    assert [facts["steps"] for event, facts in told if event == "restored"] == [300]
+    for name in ("agents.csv", "curves.npz", "evaluation.npz", "weights.npz"):
+        assert (tmp_path / "half" / name).read_bytes() == (directory / name).read_bytes()
+    assert np.isfinite(again.agents["best_lifetime"]).all()

@@ -16,6 +16,7 @@ from uavmec_jax.studies import host
 from uavmec_jax.studies.archive import holds_run, load_results, partial_results, put_together, set_damaged_aside
 from uavmec_jax.studies.durable.folder import PLAN, SHARDS, Durability, RunFolder
 from uavmec_jax.studies.durable.leases import Leases
+from uavmec_jax.studies.durable.log import writer_class
 from uavmec_jax.studies.durable.stopping import Stop
 from uavmec_jax.studies.durable.team import work_together
 from uavmec_jax.studies.durable.worker import make_worker
@@ -80,7 +81,7 @@ def run_study(
 
     Raises:
         StudyError: the population does not fit, the directory cannot take a run or somebody is at work in it, shards
-            have failed, or ``reward`` stands beside an axis of rewards.
+            have failed, ``reward`` stands beside an axis of rewards, or tensorboardX is wanted and not installed.
     """
     if reward is not None and "reward" in study.axes:
         raise StudyError(f"{study.name}: axes.reward is given, and a reward function too; leave one of them out")
@@ -99,6 +100,8 @@ def run_study(
         return _run_in_memory(study, plan, bench, label, on_progress)
     path = Path(directory)
     durability = durability or Durability()
+    if durability.tensorboard:
+        writer_class()
     lease = Leases(durability.lease_s).hold(path / SHARDS, _HELP.format(path))
     try:
         check_directory(path)

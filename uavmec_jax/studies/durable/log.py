@@ -27,7 +27,7 @@ class Log:
         self._boards: dict[int, Any] = {}
         self._tensorboard = tensorboard
         if tensorboard:
-            _writer_class()
+            writer_class()
 
     def tell(self, event: str, **facts: Any) -> None:
         """One event."""
@@ -49,7 +49,7 @@ class Log:
         if self._tensorboard and self._folder is not None:
             if shard not in self._boards:
                 folder = self._folder.parent / "tensorboard" / f"shard-{shard:05d}"
-                self._boards[shard] = _writer_class()(str(folder))
+                self._boards[shard] = writer_class()(str(folder))
             for name, value in values.items():
                 self._boards[shard].add_scalar(name, value, steps)
 
@@ -63,7 +63,7 @@ class Log:
         self._boards.clear()
 
 
-def _writer_class() -> Any:
+def writer_class() -> Any:
     """TensorBoard's writer.
 
     Raises:
