@@ -11,9 +11,9 @@ from numpy.testing import assert_array_equal
 from uavmec_jax.errors import PolicyError, StudyError
 from uavmec_jax.reporting import canvas, figures, tables
 from uavmec_jax.studies import host
-from uavmec_jax.studies.archive import load_results, load_weights
+from uavmec_jax.studies.archive import check_directory, load_results, load_weights
 from uavmec_jax.studies.plan import BYTES_WITHOUT_TRAINING, plan_study
-from uavmec_jax.studies.run import check_directory, resume_run, run_study
+from uavmec_jax.studies.run import resume_run, run_study
 from uavmec_jax.studies.study import parse_study
 
 TOML = """

@@ -86,10 +86,10 @@ def conclude(results: Any, directory: Path, console: Any, as_json: bool) -> None
 
 @click.command()
 @_DIRECTORY
-@_WORKERS
+@click.option("--workers", type=click.IntRange(1, 256), help="Processes on this machine (default: as planned).")
 @click.option("--other-code", is_flag=True, help="Go on although code or libraries have changed; the bits may differ.")
 @click.option("--json", "as_json", is_flag=True, help="Print the cells as JSON on standard output.")
-def resume(directory: Path, workers: int, other_code: bool, as_json: bool) -> None:
+def resume(directory: Path, workers: int | None, other_code: bool, as_json: bool) -> None:
     """Go on with the run in DIRECTORY, which was stopped or killed, and end as if nothing had happened."""
     from uavmec_jax.studies import host
 

@@ -43,7 +43,7 @@ def plan(
 
     from uavmec_jax.planning.outlook import look_ahead
     from uavmec_jax.reporting.outlook import outlook_data, outlook_summary, outlook_tables, save_outlook
-    from uavmec_jax.studies.run import check_directory
+    from uavmec_jax.studies.archive import check_directory
     from uavmec_jax.studies.scenario import load_scenario
 
     inventory, keys = load_scenario(

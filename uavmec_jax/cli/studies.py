@@ -56,9 +56,10 @@ def run(
     from rich.console import Console
 
     from uavmec_jax.reporting.progress import progress_bar
+    from uavmec_jax.studies.archive import check_directory
     from uavmec_jax.studies.durable.folder import Durability
     from uavmec_jax.studies.plan import plan_study
-    from uavmec_jax.studies.run import check_directory, run_study
+    from uavmec_jax.studies.run import run_study
     from uavmec_jax.studies.study import load_study
 
     console = Console(stderr=as_json)

@@ -13,10 +13,39 @@ from flax import traverse_util
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files import load_arrays
 from uavmec_jax.studies.collection import WEIGHTS, read_collection
-from uavmec_jax.studies.durable.folder import PLAN, RunFolder
+from uavmec_jax.studies.durable.folder import PLAN, SHARDS, RunFolder
+from uavmec_jax.studies.durable.leases import Leases, named
 from uavmec_jax.studies.results import AGENTS, CURVES, EVALUATION, RUN, SCHEMA, STUDY, Results
 from uavmec_jax.studies.shard import Finished
 from uavmec_jax.studies.study import cell_axes, load_study
+
+
+def check_directory(directory: Path) -> None:
+    """Refuse a folder that cannot take a run.
+
+    Raises:
+        StudyError: it holds a run or something else, somebody is at work in it, or it is a file.
+    """
+    if (holder := Leases().holder(directory / SHARDS)) is not None:
+        raise StudyError(f"{directory}: {named(holder)} is at work in it{help_with(directory)}")
+    check_empty(directory)
+
+
+def check_empty(directory: Path) -> None:
+    """Refuse a folder that holds anything but claims."""
+    if holds_run(directory) or (directory / PLAN).exists():
+        raise StudyError(
+            f"{directory}: already holds a run; go on with it by `uavmec resume`, or give another folder with --out"
+        )
+    if directory.exists() and not directory.is_dir():
+        raise StudyError(f"{directory}: exists and is not an empty folder; give another one with --out")
+    if directory.exists() and any(file.name != SHARDS for file in directory.iterdir()):
+        raise StudyError(f"{directory}: exists and is not an empty folder; give another one with --out")
+
+
+def help_with(directory: Path) -> str:
+    """What somebody may do who finds a run at work."""
+    return f"; to help it, start `uavmec worker {directory}`"
 
 
 def put_together(folder: RunFolder, **more: Any) -> Results:

@@ -13,8 +13,16 @@ from typing import Any
 from uavmec_jax.errors import StudyError
 from uavmec_jax.learning.population import Progress
 from uavmec_jax.studies import host
-from uavmec_jax.studies.archive import holds_run, load_results, partial_results, put_together, set_damaged_aside
-from uavmec_jax.studies.durable.folder import PLAN, SHARDS, Durability, RunFolder
+from uavmec_jax.studies.archive import (
+    check_directory,
+    check_empty,
+    help_with,
+    load_results,
+    partial_results,
+    put_together,
+    set_damaged_aside,
+)
+from uavmec_jax.studies.durable.folder import SHARDS, Durability, RunFolder
 from uavmec_jax.studies.durable.leases import Leases
 from uavmec_jax.studies.durable.log import writer_class
 from uavmec_jax.studies.durable.stopping import Stop
@@ -30,24 +38,6 @@ from uavmec_jax.studies.study import seeds_of
 OnProgress = Callable[[Progress], None]
 OnEvent = Callable[[str, dict[str, Any]], None]
 RewardFunction = Callable[[Mapping[str, Any]], Any]
-
-_HELP = "; to help it, start `uavmec worker {}`"
-
-
-def check_directory(directory: Path) -> None:
-    """Refuse a folder that cannot take a run.
-
-    Raises:
-        StudyError: it holds a run or something else, or is a file.
-    """
-    if holds_run(directory) or (directory / PLAN).exists():
-        raise StudyError(
-            f"{directory}: already holds a run; go on with it by `uavmec resume`, or give another folder with --out"
-        )
-    if directory.exists() and not directory.is_dir():
-        raise StudyError(f"{directory}: exists and is not an empty folder; give another one with --out")
-    if directory.exists() and any(file.name != SHARDS for file in directory.iterdir()):
-        raise StudyError(f"{directory}: exists and is not an empty folder; give another one with --out")
 
 
 def run_study(
@@ -102,9 +92,9 @@ def run_study(
     durability = durability or Durability()
     if durability.tensorboard:
         writer_class()
-    lease = Leases(durability.lease_s).hold(path / SHARDS, _HELP.format(path))
+    lease = Leases(durability.lease_s).hold(path / SHARDS, help_with(path))
     try:
-        check_directory(path)
+        check_empty(path)
         RunFolder.create(path, study, plan, durability, label)
         return _run(path, bench, workers, on_progress, on_event)
     finally:
@@ -134,9 +124,9 @@ def prepare_run(
     path, durability = Path(directory), durability or Durability()
     check_directory(path)
     plan = plan_study(study, workers=workers, shard_size=shard_size, jobs=jobs)
-    lease = Leases(durability.lease_s).hold(path / SHARDS, _HELP.format(path))
+    lease = Leases(durability.lease_s).hold(path / SHARDS, help_with(path))
     try:
-        check_directory(path)
+        check_empty(path)
         return RunFolder.create(path, study, plan, durability, _label(study, plan, command))
     finally:
         lease.release()
@@ -146,7 +136,7 @@ def resume_run(
     directory: str | Path,
     *,
     reward: RewardFunction | None = None,
-    workers: int = 1,
+    workers: int | None = None,
     other_code: bool = False,
     on_progress: OnProgress = lambda _: None,
     on_event: OnEvent = lambda event, facts: None,
@@ -158,7 +148,7 @@ def resume_run(
     Args:
         directory: of the run.
         reward: the function that the run was started with, if it was.
-        workers: processes.
+        workers: processes; by default as many as the run was planned for.
         other_code: go on although code or libraries are not those that planned the run; its label then says so.
         on_progress: told after every chunk.
         on_event: told ``(event, facts)`` of everything that is logged.
@@ -178,12 +168,13 @@ def resume_run(
         return load_results(path)
     if not other_code:
         folder.check_code()
-    lease = Leases(folder.durability.lease_s).hold(folder.shards_folder, _HELP.format(path))
+    lease = Leases(folder.durability.lease_s).hold(folder.shards_folder, help_with(path))
     try:
         for shard in folder.plan.shards:
             folder.failure(shard).unlink(missing_ok=True)
         label = {"other_code": differ} if (differ := folder.other_code()) else {}
-        return _run(path, Bench(folder.study, folder.plan, reward), workers, on_progress, on_event, label)
+        bench = Bench(folder.study, folder.plan, reward)
+        return _run(path, bench, workers or folder.plan.workers, on_progress, on_event, label)
     finally:
         lease.release()
 
