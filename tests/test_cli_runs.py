@@ -7,7 +7,7 @@ from click.testing import CliRunner
 
 from tests.studies.durable.runs import TINY
 from uavmec_jax.cli import main
-from uavmec_jax.studies.run import prepare_run
+from uavmec_jax.studies.shared_run import prepare_run
 from uavmec_jax.studies.study import parse_study
 
 

@@ -25,11 +25,11 @@ from .studies.plan import plan_study as plan_study
 from .studies.policies import TrainedPolicy as TrainedPolicy
 from .studies.policies import load_policy as load_policy
 from .studies.results import Results as Results
-from .studies.run import prepare_run as prepare_run
 from .studies.run import resume_run as resume_run
 from .studies.run import run_study as run_study
-from .studies.run import work_on as work_on
 from .studies.schema import Study as Study
+from .studies.shared_run import prepare_run as prepare_run
+from .studies.shared_run import work_on as work_on
 from .studies.study import load_study as load_study
 from .studies.sweep import Trained as Trained
 from .studies.sweep import train as train

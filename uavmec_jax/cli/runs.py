@@ -142,7 +142,7 @@ def worker(directory: Path, share: str | None, no_wait: bool) -> None:
     from rich.console import Console
 
     from uavmec_jax.studies.durable.stopping import Stopped
-    from uavmec_jax.studies.run import work_on
+    from uavmec_jax.studies.shared_run import work_on
 
     try:
         complete = work_on(directory, wait=not no_wait, on_event=teller(Console()))
@@ -195,7 +195,7 @@ def submit(
     host.use_every_core()
     from uavmec_jax.studies.durable.cluster import submit_workers
     from uavmec_jax.studies.durable.folder import Durability
-    from uavmec_jax.studies.run import prepare_run
+    from uavmec_jax.studies.shared_run import prepare_run
     from uavmec_jax.studies.study import load_study
 
     resolved = load_study(study, dict(assignment(setting) for setting in settings))

@@ -1,9 +1,11 @@
 """What a run leaves: files that are read back without pickle, each written whole or not at all."""
 
+import datetime
 import hashlib
 import json
+import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +14,15 @@ import pandas as pd
 from flax import traverse_util
 
 from uavmec_jax.files import write_arrays, write_text
+from uavmec_jax.studies import host
 from uavmec_jax.studies.collection import WEIGHTS, Collection, write_collection
 from uavmec_jax.studies.evaluation import device_number
+from uavmec_jax.studies.places import describe_places
+from uavmec_jax.studies.plan import Plan
 from uavmec_jax.studies.schema import PLANNERS, Study
 from uavmec_jax.studies.shard import Finished
 from uavmec_jax.studies.statistics import mean_interval
-from uavmec_jax.studies.study import cell_axes, study_toml
+from uavmec_jax.studies.study import cell_axes, seeds_of, study_toml
 
 SCHEMA = 2
 """Version of the run folder. In version 1 curves and weights did not name their algorithm: it was the DQN."""
@@ -225,3 +230,20 @@ def _joined(pieces: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
 def _first_to_fail(policy: str, share: np.ndarray) -> dict[str, Any]:
     """The device (from 1, 0 for none) that is first most often, of ``share [n]``."""
     return {f"{policy}_first_device": device_number(share), f"{policy}_first_share": float(share.max())}
+
+
+def label_of(study: Study, plan: Plan, command: str | None) -> dict[str, Any]:
+    """What is known of a run before it starts, for ``run.json``."""
+    return {
+        "schema": SCHEMA,
+        "study": study.name,
+        "command": command or " ".join(sys.argv),
+        "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "complete": False,
+        "agents": plan.agents,
+        "seeds": seeds_of(study),
+        **({"places": places} if (places := describe_places(study)) else {}),
+        "workers": plan.workers,
+        "blocks": {name: asdict(blocks) for name, blocks in plan.blocks.items()},
+        **host.describe(),
+    }

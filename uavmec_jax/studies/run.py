@@ -1,18 +1,14 @@
 """Run a study: in this process or by several, in one go or taken up again; and put together what they left."""
 
-import datetime
 import shutil
-import sys
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from uavmec_jax.errors import StudyError
 from uavmec_jax.learning.population import Progress
-from uavmec_jax.studies import host
 from uavmec_jax.studies.archive import (
     check_directory,
     check_empty,
@@ -27,16 +23,12 @@ from uavmec_jax.studies.durable.leases import Leases
 from uavmec_jax.studies.durable.log import writer_class
 from uavmec_jax.studies.durable.stopping import Stop
 from uavmec_jax.studies.durable.team import work_together
-from uavmec_jax.studies.durable.worker import make_worker
-from uavmec_jax.studies.places import describe_places
+from uavmec_jax.studies.durable.worker import OnEvent, OnProgress, make_worker
 from uavmec_jax.studies.plan import Plan, plan_study
-from uavmec_jax.studies.results import SCHEMA, Results
+from uavmec_jax.studies.results import Results, label_of
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.studies.shard import Bench, Finished
-from uavmec_jax.studies.study import seeds_of
 
-OnProgress = Callable[[Progress], None]
-OnEvent = Callable[[str, dict[str, Any]], None]
 RewardFunction = Callable[[Mapping[str, Any]], Any]
 
 
@@ -82,7 +74,7 @@ def run_study(
     if directory is not None:
         check_directory(Path(directory))
     plan = plan_study(study, workers=workers, shard_size=shard_size)
-    label = _label(study, plan, command)
+    label = label_of(study, plan, command)
     if reward is not None:
         label["reward_function"] = getattr(reward, "__qualname__", repr(reward))
     bench = Bench(study, plan, reward)
@@ -97,37 +89,6 @@ def run_study(
         check_empty(path)
         RunFolder.create(path, study, plan, durability, label)
         return _run(path, bench, workers, on_progress, on_event)
-    finally:
-        lease.release()
-
-
-def prepare_run(
-    study: Study,
-    directory: str | Path,
-    *,
-    command: str | None = None,
-    workers: int = 1,
-    shard_size: int | None = None,
-    jobs: int = 1,
-    durability: Durability | None = None,
-) -> RunFolder:
-    """Plan a run that workers (:func:`work_on`) then make.
-
-    Args:
-        study, directory, command, shard_size, durability: see :func:`run_study`.
-        workers: processes that share one machine.
-        jobs: workers on all machines together.
-
-    Raises:
-        StudyError: see :func:`run_study`.
-    """
-    path, durability = Path(directory), durability or Durability()
-    check_directory(path)
-    plan = plan_study(study, workers=workers, shard_size=shard_size, jobs=jobs)
-    lease = Leases(durability.lease_s).hold(path / SHARDS, help_with(path))
-    try:
-        check_empty(path)
-        return RunFolder.create(path, study, plan, durability, _label(study, plan, command))
     finally:
         lease.release()
 
@@ -177,45 +138,6 @@ def resume_run(
         return _run(path, bench, workers or folder.plan.workers, on_progress, on_event, label)
     finally:
         lease.release()
-
-
-def work_on(
-    directory: str | Path,
-    *,
-    wait: bool = True,
-    on_progress: OnProgress = lambda _: None,
-    on_event: OnEvent = lambda event, facts: None,
-) -> bool:
-    """Be one more worker of a run, until all of its shards are finished; tells whether they are.
-
-    The last one to finish puts the results together, unless somebody who started the run waits to do it.
-
-    Args:
-        directory: of the run, which hosts may share.
-        wait: for shards that others hold, to take over if they die.
-        on_progress: told after every chunk.
-        on_event: told ``(event, facts)`` of everything that is logged.
-
-    Raises:
-        StudyError: the directory holds no run, its plan is damaged, or it was planned by other code.
-        Stopped: a signal came; what this worker had is kept.
-    """
-    path = Path(directory)
-    with Stop() as stop:
-        worker = make_worker(path, stop=stop, on_progress=on_progress, on_event=on_event)
-        worker.folder.check_code()
-        try:
-            worker.work(wait=wait)
-        finally:
-            worker.log.close()
-        complete = all(state == "done" for _, state, _ in worker.folder.states())
-        if complete and (lease := worker.leases.claim(worker.folder.shards_folder)) is not None:
-            try:
-                if not worker.folder.complete:
-                    put_together(worker.folder)
-            finally:
-                lease.release()
-    return complete
 
 
 def _run(
@@ -283,19 +205,3 @@ def _run_in_memory(study: Study, plan: Plan, bench: Bench, label: dict, on_progr
     if interrupted:
         results.run["stopped_by"] = 2
     return results
-
-
-def _label(study: Study, plan: Plan, command: str | None) -> dict[str, Any]:
-    return {
-        "schema": SCHEMA,
-        "study": study.name,
-        "command": command or " ".join(sys.argv),
-        "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "complete": False,
-        "agents": plan.agents,
-        "seeds": seeds_of(study),
-        **({"places": places} if (places := describe_places(study)) else {}),
-        "workers": plan.workers,
-        "blocks": {name: asdict(blocks) for name, blocks in plan.blocks.items()},
-        **host.describe(),
-    }

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from tests.studies.durable.runs import TINY, bits, events, start, uavmec
-from uavmec_jax.studies.run import prepare_run
+from uavmec_jax.studies.shared_run import prepare_run
 from uavmec_jax.studies.study import load_study
 
 pytestmark = pytest.mark.slow

@@ -17,7 +17,8 @@ from uavmec_jax.studies.archive import load_results
 from uavmec_jax.studies.durable import folder as folders
 from uavmec_jax.studies.durable.folder import Durability, RunFolder
 from uavmec_jax.studies.durable.status import run_status
-from uavmec_jax.studies.run import prepare_run, resume_run, run_study, work_on
+from uavmec_jax.studies.run import resume_run, run_study
+from uavmec_jax.studies.shared_run import prepare_run, work_on
 from uavmec_jax.studies.study import parse_study
 
 pytestmark = pytest.mark.slow

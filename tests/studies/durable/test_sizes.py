@@ -8,7 +8,8 @@ from tests.studies.durable.runs import TINY
 from uavmec_jax.errors import StudyError
 from uavmec_jax.studies.durable.status import run_status
 from uavmec_jax.studies.plan import plan_study
-from uavmec_jax.studies.run import prepare_run, run_study
+from uavmec_jax.studies.run import run_study
+from uavmec_jax.studies.shared_run import prepare_run
 from uavmec_jax.studies.simulate import simulate
 from uavmec_jax.studies.study import load_study, parse_study
 

@@ -44,6 +44,6 @@ def _work(directory: str) -> bool:
     from uavmec_jax.studies import host
 
     host.use_every_core()
-    from uavmec_jax.studies.run import work_on
+    from uavmec_jax.studies.shared_run import work_on
 
     return work_on(directory)

@@ -6,6 +6,7 @@ import traceback
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files import write_text
@@ -19,6 +20,9 @@ from uavmec_jax.studies.durable.snapshots import Snapshots
 from uavmec_jax.studies.durable.stopping import Stop
 from uavmec_jax.studies.plan import Shard
 from uavmec_jax.studies.shard import Bench, Finished
+
+OnProgress = Callable[[Progress], None]
+OnEvent = Callable[[str, dict[str, Any]], None]
 
 POLL_S = 1.0
 """Seconds between looks at shards that others hold."""
@@ -41,7 +45,7 @@ class Worker:
     bench: Bench
     stop: Stop
     log: Log
-    on_progress: Callable[[Progress], None] = lambda _: None
+    on_progress: OnProgress = lambda _: None
     leases: Leases = field(default_factory=Leases)
     _over: set[int] = field(default_factory=set)
     _done_steps: int = 0
@@ -188,8 +192,8 @@ def make_worker(
     *,
     bench: Bench | None = None,
     stop: Stop,
-    on_progress: Callable[[Progress], None] = lambda _: None,
-    on_event: Callable[[str, dict], None] = lambda event, facts: None,
+    on_progress: OnProgress = lambda _: None,
+    on_event: OnEvent = lambda event, facts: None,
 ) -> Worker:
     """A worker for the run in a folder.
 

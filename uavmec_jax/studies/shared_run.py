@@ -1,0 +1,82 @@
+"""Runs that are planned by one process and made by workers, on as many machines as share the folder."""
+
+from pathlib import Path
+
+from uavmec_jax.studies.archive import check_directory, check_empty, help_with, put_together
+from uavmec_jax.studies.durable.folder import SHARDS, Durability, RunFolder
+from uavmec_jax.studies.durable.leases import Leases
+from uavmec_jax.studies.durable.stopping import Stop
+from uavmec_jax.studies.durable.worker import OnEvent, OnProgress, make_worker
+from uavmec_jax.studies.plan import plan_study
+from uavmec_jax.studies.results import label_of
+from uavmec_jax.studies.schema import Study
+
+
+def prepare_run(
+    study: Study,
+    directory: str | Path,
+    *,
+    command: str | None = None,
+    workers: int = 1,
+    shard_size: int | None = None,
+    jobs: int = 1,
+    durability: Durability | None = None,
+) -> RunFolder:
+    """Plan a run that workers (:func:`work_on`) then make.
+
+    Args:
+        study, directory, command, shard_size, durability: see :func:`run_study`.
+        workers: processes that share one machine.
+        jobs: workers on all machines together.
+
+    Raises:
+        StudyError: see :func:`run_study`.
+    """
+    path, durability = Path(directory), durability or Durability()
+    check_directory(path)
+    plan = plan_study(study, workers=workers, shard_size=shard_size, jobs=jobs)
+    lease = Leases(durability.lease_s).hold(path / SHARDS, help_with(path))
+    try:
+        check_empty(path)
+        return RunFolder.create(path, study, plan, durability, label_of(study, plan, command))
+    finally:
+        lease.release()
+
+
+def work_on(
+    directory: str | Path,
+    *,
+    wait: bool = True,
+    on_progress: OnProgress = lambda _: None,
+    on_event: OnEvent = lambda event, facts: None,
+) -> bool:
+    """Be one more worker of a run, until all of its shards are finished; tells whether they are.
+
+    The last one to finish puts the results together, unless somebody who started the run waits to do it.
+
+    Args:
+        directory: of the run, which hosts may share.
+        wait: for shards that others hold, to take over if they die.
+        on_progress: told after every chunk.
+        on_event: told ``(event, facts)`` of everything that is logged.
+
+    Raises:
+        StudyError: the directory holds no run, its plan is damaged, or it was planned by other code.
+        Stopped: a signal came; what this worker had is kept.
+    """
+    path = Path(directory)
+    with Stop() as stop:
+        worker = make_worker(path, stop=stop, on_progress=on_progress, on_event=on_event)
+        worker.folder.check_code()
+        try:
+            worker.work(wait=wait)
+        finally:
+            worker.log.close()
+        complete = all(state == "done" for _, state, _ in worker.folder.states())
+        if complete and (lease := worker.leases.claim(worker.folder.shards_folder)) is not None:
+            try:
+                if not worker.folder.complete:
+                    put_together(worker.folder)
+            finally:
+                lease.release()
+    return complete
