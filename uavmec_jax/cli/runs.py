@@ -36,7 +36,13 @@ def durability_options(command: Callable) -> Callable:
                 "snapshot_every_s",
                 type=click.FloatRange(0),
                 default=60.0,
-                help="Seconds between snapshots, at least (default: 60); they take no more than 2 % of the time.",
+                help="Seconds between snapshots, at least (default: 60).",
+            ),
+            click.option(
+                "--snapshot-share",
+                type=click.FloatRange(0.001, 1),
+                default=0.02,
+                help="Share of the time that they may take (default: 0.02): large ones come less often.",
             ),
             click.option(
                 "--lease",

@@ -84,7 +84,7 @@ def run_study(
     durability = durability or Durability()
     if durability.tensorboard:
         writer_class()
-    lease = Leases(durability.lease_s).hold(path / SHARDS, help_with(path))
+    lease = Leases(durability.lease_s).hold(path / SHARDS, path, help_with(path))
     try:
         check_empty(path)
         RunFolder.create(path, study, plan, durability, label)
@@ -129,7 +129,7 @@ def resume_run(
         return load_results(path)
     if not other_code:
         folder.check_code()
-    lease = Leases(folder.durability.lease_s).hold(folder.shards_folder, help_with(path))
+    lease = Leases(folder.durability.lease_s).hold(folder.shards_folder, path, help_with(path))
     try:
         for shard in folder.plan.shards:
             folder.failure(shard).unlink(missing_ok=True)

@@ -35,7 +35,7 @@ def prepare_run(
     path, durability = Path(directory), durability or Durability()
     check_directory(path)
     plan = plan_study(study, workers=workers, shard_size=shard_size, jobs=jobs)
-    lease = Leases(durability.lease_s).hold(path / SHARDS, help_with(path))
+    lease = Leases(durability.lease_s).hold(path / SHARDS, path, help_with(path))
     try:
         check_empty(path)
         return RunFolder.create(path, study, plan, durability, label_of(study, plan, command))

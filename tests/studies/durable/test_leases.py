@@ -26,7 +26,7 @@ def test_one_holds_it_until_it_lets_go(tmp_path):
     lease = mine.claim(tmp_path / "shard")
     assert other.claim(tmp_path / "shard") is None
     with pytest.raises(StudyError, match=r"shard: process \d+ on .* is at work in it; to help, call"):
-        other.hold(tmp_path / "shard", "; to help, call")
+        other.hold(tmp_path / "shard", tmp_path / "shard", "; to help, call")
     lease.check()
     lease.release()
     again = other.claim(tmp_path / "shard")
@@ -81,7 +81,7 @@ def test_on_another_machine_it_takes_a_whole_lease_without_a_beat(tmp_path):
 def test_whoever_wants_to_hold_it_waits_for_a_sign_of_life(tmp_path):
     lease = Leases(QUICK).claim(tmp_path)
     elsewhere(lease)
-    assert Leases(QUICK).hold(tmp_path, "").number == 2
+    assert Leases(QUICK).hold(tmp_path, tmp_path).number == 2
 
 
 def test_beats_keep_it(tmp_path):

@@ -13,7 +13,7 @@ from uavmec_jax.files import read_text, write_text
 from uavmec_jax.learning.blocks import Blocks
 from uavmec_jax.studies import host
 from uavmec_jax.studies.durable.leases import LEASE_S, is_quiet, read_lease
-from uavmec_jax.studies.durable.snapshots import INTERVAL_S, Kind
+from uavmec_jax.studies.durable.snapshots import INTERVAL_S, SHARE, Kind
 from uavmec_jax.studies.plan import Plan, Shard
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.studies.study import parse_study, study_toml
@@ -32,13 +32,15 @@ class Durability:
 
     Attributes:
         snapshot: what is kept of a shard in training: ``full`` or ``weights``.
-        snapshot_every_s: least time between two snapshots; longer where they would take over 2 % of the time.
+        snapshot_every_s: least time between two snapshots.
+        snapshot_share: most of the time that they may take; it is longer between them where they are large.
         lease_s: seconds without a sign after which a worker on another machine counts as dead.
         tensorboard: whether curves are also written as TensorBoard's event files.
     """
 
     snapshot: Kind = "full"
     snapshot_every_s: float = INTERVAL_S
+    snapshot_share: float = SHARE
     lease_s: float = LEASE_S
     tensorboard: bool = False
 

@@ -143,8 +143,13 @@ class Leases:
         dead = _is_known_dead(holder) or holder.get("released") or now - since > self.lease_s
         return None if dead else holder
 
-    def hold(self, folder: Path, what: str) -> Lease:
+    def hold(self, folder: Path, of: Path, more: str = "") -> Lease:
         """Claim a folder, or refuse; a holder on another machine that may be dead is watched for as long as it takes.
+
+        Args:
+            folder: what is claimed.
+            of: what it is the folder of, for the message.
+            more: said after it.
 
         Raises:
             StudyError: somebody holds it, and is alive.
@@ -156,7 +161,7 @@ class Leases:
                 continue
             first = holder if first is None else first
             if holder.get("machine") == this_machine() or holder.get("beat") != first.get("beat"):
-                raise StudyError(f"{folder}: {named(holder)} is at work in it{what}")
+                raise StudyError(f"{of}: {named(holder)} is at work in it{more}")
             time.sleep(min(1.0, self.lease_s / 4))
         return lease
 

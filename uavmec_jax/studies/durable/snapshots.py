@@ -22,7 +22,7 @@ stopped is trained again from its start."""
 INTERVAL_S = 60.0
 """Least time between two snapshots."""
 
-_SHARE = 0.02
+SHARE = 0.02
 """Most of the time that snapshots may take."""
 
 _BYTES_PER_SECOND = 150e6
@@ -40,6 +40,7 @@ class Snapshots:
         folder: of the shard.
         kind: what is kept.
         every_s: least time between two, by the monotonic clock.
+        share: most of the time that they may take.
         bytes: size of one, about.
         facts: what the snapshots must be of: the plan and the shard.
         tell: told ``(event, facts)``.
@@ -49,6 +50,7 @@ class Snapshots:
     folder: Path
     kind: Kind
     every_s: float
+    share: float
     bytes: int
     facts: dict[str, Any]
     tell: Callable[..., None]
@@ -60,7 +62,7 @@ class Snapshots:
     def is_due(self) -> bool:
         """Whether it is time: the interval is over, and the cost is a small share of the time since the last one."""
         cost = self.bytes / _BYTES_PER_SECOND if self._cost_s is None else self._cost_s
-        return time.monotonic() - self._last >= max(self.every_s, cost / _SHARE)
+        return time.monotonic() - self._last >= max(self.every_s, cost / self.share)
 
     def write(self, training: Training) -> None:
         """Keep a training as it is between two chunks, whole or not at all; older generations go afterwards.

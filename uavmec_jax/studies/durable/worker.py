@@ -180,6 +180,7 @@ class Worker:
             folder=self.folder.shard_folder(shard),
             kind=durability.snapshot,
             every_s=durability.snapshot_every_s,
+            share=durability.snapshot_share,
             bytes=self.folder.plan.blocks[shard.algorithm].bytes if durability.snapshot == "full" else 0,
             facts={"run": self.folder.fingerprint, "shard": shard.number, "agents": shard.agents},
             tell=lambda event, **facts: self.log.tell(event, shard=shard.number, **facts),
