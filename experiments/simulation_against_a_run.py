@@ -29,7 +29,7 @@ def watched(command: list[str], folder: Path) -> dict[str, float]:
                 disk = max(disk, sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()))
             except (psutil.NoSuchProcess, FileNotFoundError):
                 pass
-            time.sleep(0.25)
+            time.sleep(0.05)
     if process.returncode:
         sys.exit(process.returncode)
     return {"wall_s": time.perf_counter() - started, "disk_bytes": disk, "memory_bytes": memory}

@@ -226,7 +226,13 @@ def submit(
 
 
 def tell_simulation(
-    study: Any, speed: float | None, devices: int | None, workers: int, shard_size: int | None, as_json: bool
+    study: Any,
+    speed: float | None,
+    devices: int | None,
+    workers: int,
+    shard_size: int | None,
+    durability: Any,
+    as_json: bool,
 ) -> None:
     """What a run would take, for a given speed."""
     from uavmec_jax.studies.plan import plan_study
@@ -235,5 +241,5 @@ def tell_simulation(
     if speed is None:
         fail("--simulate needs --speed, the training steps per second of one device; `uavmec doctor` measures it")
     plan = plan_study(study, workers=workers, shard_size=shard_size)
-    found = simulate(study, plan, speed=speed, devices=devices or os.cpu_count() or 1)
+    found = simulate(study, plan, speed=speed, devices=devices or os.cpu_count() or 1, durability=durability)
     click.echo(json.dumps(found.as_json(), indent=1) if as_json else f"{study.name}: {plan}\n{found}")

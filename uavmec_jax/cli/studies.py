@@ -65,7 +65,7 @@ def run(
     console = Console(stderr=as_json)
     resolved = load_study(study, overrides)
     if simulate:
-        tell_simulation(resolved, speed, devices, workers, shard_size, as_json)
+        tell_simulation(resolved, speed, devices, workers, shard_size, Durability(**durability), as_json)
         return
     directory = out or new_folder(resolved.name)
     check_directory(directory)

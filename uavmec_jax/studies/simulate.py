@@ -8,6 +8,8 @@ from typing import Any
 
 from uavmec_jax.learning.networks import n_weights
 from uavmec_jax.learning.registry import ALGORITHMS
+from uavmec_jax.studies.durable.folder import Durability
+from uavmec_jax.studies.durable.snapshots import interval_s
 from uavmec_jax.studies.plan import Plan
 from uavmec_jax.studies.schema import TRACED_PARAMS, Study
 from uavmec_jax.studies.study import n_agents, parts
@@ -32,7 +34,7 @@ class Simulation:
     Attributes:
         training_s, other_s: wall time of training, and of compiling, judging and planning.
         disk_bytes: at most, while it goes on.
-        result_bytes: of what it leaves, before compression.
+        result_bytes: of what it leaves.
         memory_bytes: at most, of one worker.
         workers: that are at work at the same time.
         devices: that they have together.
@@ -66,7 +68,14 @@ class Simulation:
         )
 
 
-def simulate(study: Study, plan: Plan, *, speed: float | Mapping[str, float], devices: int) -> Simulation:
+def simulate(
+    study: Study,
+    plan: Plan,
+    *,
+    speed: float | Mapping[str, float],
+    devices: int,
+    durability: Durability | None = None,
+) -> Simulation:
     """Wall time, disk and memory of a run, without running it.
 
     Args:
@@ -74,8 +83,11 @@ def simulate(study: Study, plan: Plan, *, speed: float | Mapping[str, float], de
         plan: how it is cut.
         speed: training steps per second of one device; or by algorithm.
         devices: of all machines together.
+        durability: how it would be kept.
     """
-    training = other = results = 0.0
+    durability = durability or Durability()
+    kept = 0.0
+    training = other = shards = results = 0.0
     groups = max(cut.groups for cut in plan.blocks.values())
     workers = max(min(devices // groups, len(plan.shards)), 1)
     for part in parts(study):
@@ -83,7 +95,9 @@ def simulate(study: Study, plan: Plan, *, speed: float | Mapping[str, float], de
         turns = math.ceil(cut.count / workers)
         if steps:
             own = speed[part.algorithm] if isinstance(speed, Mapping) else speed
-            training += turns * cut.size * steps / (own * min(cut.groups, devices))
+            shard_s = cut.size * steps / (own * min(cut.groups, devices))
+            training += turns * shard_s
+            kept = max(kept, cut.bytes * _generations(durability, cut.bytes, shard_s))
             other += _COMPILE_S["training"]
         judged = turns * cut.size / plan.members[part.algorithm]
         draws = min(part.evaluation.planner_draws, part.evaluation.draws)
@@ -91,17 +105,25 @@ def simulate(study: Study, plan: Plan, *, speed: float | Mapping[str, float], de
             other += _COMPILE_S["planners"] + _PLANNING_S * _scenarios(part) * draws * min(judged, 1.0)
         if part.evaluation.baselines or steps:
             other += _COMPILE_S["evaluation"]
-        results += plan.members[part.algorithm] * _agent_bytes(part)
+        shards += plan.members[part.algorithm] * sum(_agent_bytes(part))
+        results += plan.members[part.algorithm] * _agent_bytes(part)[0]
     largest = max(cut.bytes for cut in plan.blocks.values())
     return Simulation(
         training_s=training,
         other_s=_START_S + other,
-        disk_bytes=2 * results + 3 * workers * largest,  # two generations of snapshots, and one being written
+        disk_bytes=shards + results + workers * kept,
         result_bytes=results,
-        memory_bytes=_PROCESS_BYTES + max(1.0 * largest, _COPIES * results),
+        memory_bytes=_PROCESS_BYTES + max(1.0 * largest, _COPIES * shards),
         workers=workers,
         devices=devices,
     )
+
+
+def _generations(durability: Durability, size: float, shard_s: float) -> int:
+    """Snapshots of a shard that lie side by side: two, and one being written, if there is time for so many."""
+    if durability.snapshot == "weights":
+        return 0
+    return min(int(shard_s / interval_s(durability.snapshot_every_s, durability.snapshot_share, size)), 3)
 
 
 def _scenarios(study: Study) -> int:
@@ -113,15 +135,15 @@ def _scenarios(study: Study) -> int:
 _PLAYED = ("seeds", "powered", "connected", "cells", "place", *TRACED_PARAMS)
 
 
-def _agent_bytes(study: Study) -> int:
-    """What one agent leaves: two sets of weights, every episode, curves and a row of the table."""
+def _agent_bytes(study: Study) -> tuple[int, int]:
+    """What one agent leaves: two sets of weights and a row of the table; and episodes and curves, which compress well."""
     n, settings = study.params.n_devices, study.evaluation
     episode = 4 + 1 + 4 * n
     episodes = len(settings.baselines) * (settings.draws + 1) + len(settings.planners) * settings.planner_draws
     if study.algorithm == "none":
-        return episode * episodes + 1000
+        return 1000, episode * episodes
     declared = ALGORITHMS[study.algorithm]
     network = declared.spec_of(getattr(study, study.algorithm).model_dump(), n_devices=n).network
     looks = study.steps // settings.validate_every + 1
-    learned = 2 * 4 * n_weights(network, 2 * n) + 2 * episode * (settings.draws + 1) + 4 * 5 * looks
-    return learned + episode * episodes + 1000
+    episodes += 2 * (settings.draws + 1)
+    return 2 * 4 * n_weights(network, 2 * n) + 1000, episode * episodes + 4 * 5 * looks

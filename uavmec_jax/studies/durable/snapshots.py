@@ -32,6 +32,11 @@ _KEPT = 2
 """Generations."""
 
 
+def interval_s(every_s: float, share: float, size: float, cost_s: float | None = None) -> float:
+    """Seconds between two snapshots of ``size`` bytes; ``cost_s`` is what one is known to take."""
+    return max(every_s, (size / _BYTES_PER_SECOND if cost_s is None else cost_s) / share)
+
+
 @dataclass
 class Snapshots:
     """The snapshots of one shard.
@@ -61,8 +66,7 @@ class Snapshots:
     @property
     def is_due(self) -> bool:
         """Whether it is time: the interval is over, and the cost is a small share of the time since the last one."""
-        cost = self.bytes / _BYTES_PER_SECOND if self._cost_s is None else self._cost_s
-        return time.monotonic() - self._last >= max(self.every_s, cost / self.share)
+        return time.monotonic() - self._last >= interval_s(self.every_s, self.share, self.bytes, self._cost_s)
 
     def write(self, training: Training) -> None:
         """Keep a training as it is between two chunks, whole or not at all; older generations go afterwards.

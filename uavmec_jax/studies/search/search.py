@@ -21,6 +21,7 @@ from uavmec_jax.studies.search.space import (
     digest,
     holds,
     outer,
+    outer_combinations,
     own_settings,
     settings_of,
 )
@@ -175,8 +176,10 @@ def _proposed(optuna: Any, trials: "optuna.Study", space: Space, batch: int) -> 
     """The trials of a batch: those that were already proposed, and as many new ones as are missing.
 
     Every proposal has a sampler of its own, seeded by the trial's number, so that a search that was stopped proposes
-    what it would have proposed. The outer settings are those of the batch's first trial.
+    what it would have proposed. The outer settings are the same for all of a batch: the first batches have one
+    combination each, until all were tried; later ones have what the sampler chooses for their first trial.
     """
+    combinations = outer_combinations(space)
     size = min(space.batch, space.trials - batch * space.batch)
     members = [trial for trial in trials.get_trials(deepcopy=False) if trial.user_attrs.get(_BATCH) == batch]
     while len(members) < size:
@@ -184,8 +187,9 @@ def _proposed(optuna: Any, trials: "optuna.Study", space: Space, batch: int) -> 
         sampler = optuna.samplers.TPESampler(
             seed=space.seed * 1_000_003 + number, multivariate=True, n_startup_trials=space.batch
         )
-        if members:
-            fixed = {key: members[0].params[key] for key in outer(space)}
+        if members or batch < len(combinations):
+            fixed = {key: members[0].params[key] for key in outer(space)} if members else combinations[batch]
+            fixed = {key: _told(value) for key, value in fixed.items()}
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
                 sampler = optuna.samplers.PartialFixedSampler(fixed, sampler) if fixed else sampler

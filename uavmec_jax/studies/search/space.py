@@ -1,5 +1,6 @@
 """Search spaces: files that say what is searched, on which towns, and when a trial is given up."""
 
+import itertools
 import json
 import math
 from collections.abc import Mapping
@@ -189,6 +190,15 @@ def outer(space: Space) -> list[str]:
     """What shapes the program: the same for all trials of a batch."""
     declared = ALGORITHMS[space.base().algorithms[0]]
     return [key for key in space.space if key in declared.static]
+
+
+def outer_combinations(space: Space) -> list[dict[str, Any]]:
+    """Every combination of what shapes the program; the study's own first, if it is one of them."""
+    names = outer(space)
+    own = {key: value for key, value in own_settings(space).items() if key in names}
+    choices = [values.choices for key in names if isinstance(values := space.space[key], Choices)]
+    found = [dict(zip(names, combination, strict=True)) for combination in itertools.product(*choices)]
+    return sorted(found, key=lambda combination: combination != own) if names else []
 
 
 def own_settings(space: Space) -> dict[str, Any]:
