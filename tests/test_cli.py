@@ -1,12 +1,8 @@
 """The command line, as a user meets it: a subprocess."""
 
 import json
-import os
-import signal
 import subprocess
 import sys
-import time
-from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -167,29 +163,6 @@ def test_folder_with_a_run_is_refused(run_directory):
         2,
         f"uavmec: {directory}: already holds a run; give another folder with --out\n",
     )
-
-
-@pytest.mark.slow
-def test_ctrl_c_says_what_is_kept(tmp_path):
-    (tmp_path / "my.toml").write_text(TOML.replace("400", "100000000"))
-    command = [
-        sys.executable,
-        "-m",
-        "uavmec_jax",
-        "run",
-        "my.toml",
-        "--out",
-        "out",
-        "--set",
-        "dqn.replay_capacity=1000",
-    ]
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        time.sleep(25)
-        os.kill(process.pid, signal.SIGINT)
-        _, errors = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert "interrupted: no block was finished, nothing was kept" in errors
-    assert not (Path(tmp_path) / "out").exists()
 
 
 def test_evaluate_an_agent_of_a_run(run_directory, tmp_path):

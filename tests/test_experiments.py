@@ -83,7 +83,8 @@ def test_benchmark_accelerator(tmp_path):
 
 
 def test_simulation_against_a_run(tmp_path):
-    options = ["--study", "planning", "--set", "axes.seeds=1", "--set", "evaluation.draws=2"]
+    settings = ("algorithm=none", "axes.seeds=1", "axes.powered=[8]", "evaluation.draws=2", "evaluation.planners=[]")
+    options = ["--study", "planning", *(part for one in settings for part in ("--set", one))]
     out = run("simulation_against_a_run.py", *options, "--out", tmp_path / "run")
     assert "wall time" in out
     report = json.loads((tmp_path / "run" / "simulation.json").read_text())

@@ -28,6 +28,8 @@ from .studies.results import Results as Results
 from .studies.run import resume_run as resume_run
 from .studies.run import run_study as run_study
 from .studies.schema import Study as Study
+from .studies.search.search import search as search
+from .studies.search.space import load_space as load_space
 from .studies.shared_run import prepare_run as prepare_run
 from .studies.shared_run import work_on as work_on
 from .studies.study import load_study as load_study
