@@ -50,11 +50,8 @@ def main() -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     write_text(arguments.out / "throughput.json", json.dumps(report, indent=1) + "\n")
 
-    changes = (
-        {"axes.seeds": 1, "steps": 400, "evaluation.planners": [], "evaluation.baselines": ["oldest-first"]}
-        if quick
-        else {"axes.seeds": 30}
-    )
+    heuristics = {"evaluation.planners": [], "evaluation.baselines": ["oldest-first"]}
+    changes = {"axes.seeds": 1, "steps": 400} | heuristics if quick else {"axes.seeds": 30}
     directory = arguments.out / "table5"
     if (directory / "plan.json").exists():
         results = resume_run(directory)
