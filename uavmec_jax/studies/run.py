@@ -120,10 +120,7 @@ def resume_run(
     """
     path = Path(directory)
     folder = RunFolder.open(path)
-    wanted = folder.facts["label"].get("reward_function")
-    if (wanted is None) != (reward is None):
-        say = f"was started with the reward function {wanted}; give it to um.resume_run" if wanted else "had none"
-        raise StudyError(f"{path}: reward: the run {say}")
+    folder.check_reward(reward)
     if folder.complete:
         shutil.rmtree(folder.shards_folder, ignore_errors=True)
         return load_results(path)

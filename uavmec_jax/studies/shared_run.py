@@ -2,11 +2,12 @@
 
 from pathlib import Path
 
+from uavmec_jax.errors import StudyError
 from uavmec_jax.studies.archive import check_directory, check_empty, help_with, put_together
 from uavmec_jax.studies.durable.folder import SHARDS, Durability, RunFolder
 from uavmec_jax.studies.durable.leases import Leases
 from uavmec_jax.studies.durable.stopping import Stop
-from uavmec_jax.studies.durable.worker import OnEvent, OnProgress, make_worker
+from uavmec_jax.studies.durable.worker import OnEvent, OnProgress, Worker, make_worker
 from uavmec_jax.studies.plan import plan_study
 from uavmec_jax.studies.results import label_of
 from uavmec_jax.studies.schema import Study
@@ -61,22 +62,33 @@ def work_on(
         on_event: told ``(event, facts)`` of everything that is logged.
 
     Raises:
-        StudyError: the directory holds no run, its plan is damaged, or it was planned by other code.
+        StudyError: the directory holds no run, its plan is damaged, it was planned by other code, or has a reward
+            function, which only :func:`um.resume_run` can be given.
         Stopped: a signal came; what this worker had is kept.
     """
     path = Path(directory)
     with Stop() as stop:
         worker = make_worker(path, stop=stop, on_progress=on_progress, on_event=on_event)
         worker.folder.check_code()
+        worker.folder.check_reward(None)
         try:
             worker.work(wait=wait)
         finally:
             worker.log.close()
         complete = all(state == "done" for _, state, _ in worker.folder.states())
-        if complete and (lease := worker.leases.claim(worker.folder.shards_folder)) is not None:
-            try:
-                if not worker.folder.complete:
-                    put_together(worker.folder)
-            finally:
-                lease.release()
+        if complete and not worker.folder.complete:
+            _put_together_alone(worker)
     return complete
+
+
+def _put_together_alone(worker: Worker) -> None:
+    """Unless somebody holds the run who does it: the one that started it, or another worker."""
+    try:
+        lease = worker.leases.hold(worker.folder.shards_folder, worker.folder.path)
+    except StudyError:
+        return
+    try:
+        if not worker.folder.complete:
+            put_together(worker.folder)
+    finally:
+        lease.release()

@@ -244,6 +244,21 @@ def test_a_shard_that_fails_does_not_stop_the_others(whole, tmp_path, monkeypatc
     assert bits(tmp_path / "run") == bits(whole)
 
 
+def test_a_reward_function_is_given_again(tmp_path):
+    def survival(terms):
+        return terms["U"]
+
+    run_study(STUDY, tmp_path / "run", reward=survival, command="x", shard_size=2, on_progress=stop_after(3))
+    for attempt in (resume_run, work_on):
+        with pytest.raises(
+            StudyError, match=r"was started with the reward function .*survival; give it to um.resume_run"
+        ):
+            attempt(tmp_path / "run")
+    again = resume_run(tmp_path / "run", reward=survival)
+    assert again.run["complete"]
+    assert again.run["reward_function"].endswith("survival")
+
+
 @pytest.mark.parametrize("name", ["a b", "täst-ünï-日本", "deep/er/../run", "link"])
 def test_any_path_will_do(whole, tmp_path, name):
     (tmp_path / "deep" / "er").mkdir(parents=True)

@@ -139,6 +139,17 @@ class RunFolder:
                 "resume it with that code, or say --other-code"
             )
 
+    def check_reward(self, given: Any) -> None:
+        """A reward that is a function of Python is not in the plan.
+
+        Raises:
+            StudyError: the run was started with one and none is given, or the other way round.
+        """
+        wanted = self.facts["label"].get("reward_function")
+        if (wanted is None) != (given is None):
+            say = f"was started with the reward function {wanted}; give it to um.resume_run" if wanted else "had none"
+            raise StudyError(f"{self.path}: reward: the run {say}")
+
     @property
     def complete(self) -> bool:
         """Whether the results have been put together, which is the last thing that is done."""
