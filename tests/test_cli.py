@@ -54,7 +54,7 @@ def test_help_does_not_import_jax():
 
 def test_run_prints_the_tables_and_leaves_the_files(run_directory):
     directory, done = run_directory
-    assert "4 agents x 200 steps in 1 block" in done.stdout
+    assert "4 agents x 200 steps in 1 shard" in done.stdout
     for words in (
         "Lifetime in slots, `best` weights",
         "`last` weights",
@@ -65,7 +65,8 @@ def test_run_prints_the_tables_and_leaves_the_files(run_directory):
         assert words in done.stdout
     names = {file.name for file in directory.iterdir()}
     assert names == {
-        "study.toml", "run.json", "agents.csv", "curves.npz", "evaluation.npz", "weights.npz", "figure.png"
+        "study.toml", "run.json", "agents.csv", "curves.npz", "evaluation.npz", "weights.npz", "figure.png",
+        "plan.json", "log",
     }  # fmt: skip
     run = json.loads((directory / "run.json").read_text())
     assert run["command"] == "uavmec run my.toml --out out --set dqn.gamma=0.9 --steps 200"
@@ -161,7 +162,7 @@ def test_folder_with_a_run_is_refused(run_directory):
     done = CliRunner().invoke(main, ["run", "table5", "--out", str(directory)])
     assert (done.exit_code, done.stderr) == (
         2,
-        f"uavmec: {directory}: already holds a run; give another folder with --out\n",
+        f"uavmec: {directory}: already holds a run; go on with it by `uavmec resume`, or give another folder with --out\n",
     )
 
 

@@ -92,6 +92,8 @@ def open_checked(
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             facts = _checked_facts(path, archive, schema, what, error)
             yield facts, _Members(archive)
+    except UserError:
+        raise
     except _DAMAGE as damage:
         raise error(f"{path}: cannot be read: {damage}") from None
 

@@ -201,8 +201,9 @@ def test_diverged_agent_is_frozen_marked_and_touches_nobody(bad, step):
     for leaf, other in zip(*map(jax.tree.leaves, (state.weights, without.weights)), strict=True):
         assert np.isfinite(leaf).all()
         assert_array_equal(leaf[jnp.array([0, 2])], other[jnp.array([0, 2])])
-    fresh = train(SPEC, stack(sound), 0, 0)
-    jax.tree.map(lambda a, b: assert_array_equal(a[1], b[1]), state.weights, fresh.weights)
+    if step == 104:  # not one update was made
+        fresh = train(SPEC, stack(sound), 0, 0)
+        jax.tree.map(lambda a, b: assert_array_equal(a[1], b[1]), state.weights, fresh.weights)
 
 
 def test_loss_that_overflows_freezes_later():

@@ -10,6 +10,8 @@ from uavmec_jax.errors import StudyError
 from uavmec_jax.studies.durable import leases as module
 from uavmec_jax.studies.durable.leases import LeaseLostError, Leases, is_quiet, read_lease
 
+pytestmark = pytest.mark.slow
+
 QUICK = 0.3
 
 
