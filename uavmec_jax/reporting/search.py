@@ -12,7 +12,7 @@ from uavmec_jax.reporting.canvas import new_figure
 from uavmec_jax.studies.search.search import Found
 from uavmec_jax.studies.search.space import own_settings
 
-_SHOWN = 8
+_SHOWN = 5
 """Trials in the table."""
 
 
@@ -21,14 +21,12 @@ def search_tables(found: Found) -> dict[str, Table]:
     trials = found.trials
     done = trials[trials["state"] == "complete"].sort_values("value", ascending=False).head(_SHOWN)
     what = "mean lifetime" if found.space.objective == "mean" else "lower end of the mean lifetime's interval"
-    names = list(found.space.space)
     best = Table()
-    for name in ("trial", "slots", *names):
-        best.add_column(name, justify="right")
-    for _, trial in done.iterrows():
-        best.add_row(str(trial["number"]), f"{trial['value']:.2f}", *(_short(trial[name]) for name in names))
-    best.add_section()
-    best.add_row("study", "", *(_short(value) for value in own_settings(found.space).values()), style="dim")
+    for name in ("setting", "study", *(f"trial {number}" for number in done["number"])):
+        best.add_column(name, justify="left" if name == "setting" else "right")
+    best.add_row("slots", "", *(f"{value:.2f}" for value in done["value"]), end_section=True)
+    for name, own in own_settings(found.space).items():
+        best.add_row(name, _short(own), *(_short(value) for value in done[name]))
     importance = Table()
     importance.add_column("setting")
     importance.add_column("importance", justify="right")
