@@ -12,7 +12,7 @@ from uavmec_jax.reporting.canvas import new_figure
 from uavmec_jax.studies.search.search import Found
 from uavmec_jax.studies.search.space import own_settings
 
-_SHOWN = 5
+_SHOWN = 4
 """Trials in the table."""
 
 

@@ -259,6 +259,19 @@ def test_a_reward_function_is_given_again(tmp_path):
     assert again.run["reward_function"].endswith("survival")
 
 
+def test_weights_snapshots_are_policies_and_the_shard_starts_again(whole, tmp_path):
+    light = Durability(snapshot="weights", snapshot_every_s=0.0, snapshot_share=1.0)
+    run_study(STUDY, tmp_path / "run", command="x", shard_size=2, durability=light, on_progress=stop_after(10))
+    older, newest = sorted((tmp_path / "run" / "shards" / "00000").glob("snapshot-*.npz"))
+    policy = um.load_policy(newest, seed=0, powered=12)
+    layout = um.sample_layout(jax.random.key(0), um.Params(), 12, 8)
+    assert 0 <= policy(um.Params(), layout, um.initial_state(um.Params(), layout)) < 12
+    assert older.stat().st_size < 300_000
+    resume_run(tmp_path / "run")
+    assert not events(tmp_path / "run", "restored")
+    assert bits(tmp_path / "run") == bits(whole)
+
+
 @pytest.mark.parametrize("name", ["a b", "täst-ünï-日本", "deep/er/../run", "link"])
 def test_any_path_will_do(whole, tmp_path, name):
     (tmp_path / "deep" / "er").mkdir(parents=True)
