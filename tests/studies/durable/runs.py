@@ -26,6 +26,22 @@ baselines = ["oldest-first"]
 """
 
 
+class Enough(KeyboardInterrupt):
+    """Somebody presses Ctrl-C."""
+
+
+def stop_after(chunks):
+    """Told of progress, interrupts after so many chunks."""
+    told = []
+
+    def on_progress(news):
+        told.append(news)
+        if len(told) == chunks:
+            raise Enough
+
+    return on_progress
+
+
 def command(*arguments) -> list[str]:
     return [sys.executable, "-m", "uavmec_jax", *map(str, arguments)]
 

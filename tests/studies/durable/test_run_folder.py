@@ -3,14 +3,13 @@
 import json
 import re
 import shutil
-from dataclasses import replace
 
 import jax
 import numpy as np
 import pytest
 
 import uavmec_jax as um
-from tests.studies.durable.runs import FINAL, TINY, bits, events
+from tests.studies.durable.runs import FINAL, TINY, Enough, bits, events, stop_after
 from uavmec_jax.errors import StudyError
 from uavmec_jax.studies import run as running
 from uavmec_jax.studies.archive import load_results
@@ -25,22 +24,6 @@ pytestmark = pytest.mark.slow
 
 STUDY = parse_study(TINY, "tiny")
 OFTEN = Durability(snapshot_every_s=0.0)
-
-
-class Enough(KeyboardInterrupt):
-    """Somebody presses Ctrl-C."""
-
-
-def stop_after(chunks):
-    """Told of progress, interrupts after so many chunks."""
-    told = []
-
-    def on_progress(news):
-        told.append(news)
-        if len(told) == chunks:
-            raise Enough
-
-    return on_progress
 
 
 @pytest.fixture(scope="module")
@@ -244,21 +227,6 @@ def test_a_shard_that_fails_does_not_stop_the_others(whole, tmp_path, monkeypatc
     assert bits(tmp_path / "run") == bits(whole)
 
 
-def test_a_reward_function_is_given_again(tmp_path):
-    def survival(terms):
-        return terms["U"]
-
-    run_study(STUDY, tmp_path / "run", reward=survival, command="x", shard_size=2, on_progress=stop_after(3))
-    for attempt in (resume_run, work_on):
-        with pytest.raises(
-            StudyError, match=r"was started with the reward function .*survival; give it to um.resume_run"
-        ):
-            attempt(tmp_path / "run")
-    again = resume_run(tmp_path / "run", reward=survival)
-    assert again.run["complete"]
-    assert again.run["reward_function"].endswith("survival")
-
-
 def test_weights_snapshots_are_policies_and_the_shard_starts_again(whole, tmp_path):
     light = Durability(snapshot="weights", snapshot_every_s=0.0, snapshot_share=1.0)
     run_study(STUDY, tmp_path / "run", command="x", shard_size=2, durability=light, on_progress=stop_after(10))
@@ -280,30 +248,6 @@ def test_any_path_will_do(whole, tmp_path, name):
     run_study(STUDY, tmp_path / name, command="x", shard_size=2, on_progress=stop_after(3))
     resume_run(tmp_path / name)
     assert bits(tmp_path / name) == bits(whole)
-
-
-def test_agents_that_diverge_leave_the_others_alone(tmp_path):
-    """Learning rates of 1e30, beside one that is sound (NaN and infinity: `tests/learning/test_dqn.py`)."""
-    rates = {"axes.learning_rate": [7e-4, 1e30], "axes.powered": [8], "algorithm": "dqn", "steps": 1000}
-    both = run_study(parse_study(TINY, "tiny", rates)).agents
-    assert (both["diverged_at"] >= 0).tolist() == [False, True, False, True]
-
-
-def test_curves_go_to_tensorboard_too(tmp_path):
-    from tensorboardX.proto.event_pb2 import Event
-
-    run_study(STUDY, tmp_path / "run", durability=replace(OFTEN, tensorboard=True))
-    (file,) = (tmp_path / "run" / "tensorboard" / "shard-00000").iterdir()
-    data, values = file.read_bytes(), {}
-    while data:
-        length = int.from_bytes(data[:8], "little")
-        for value in Event.FromString(data[12 : 12 + length]).summary.value:
-            values.setdefault(value.tag, []).append(value.simple_value)
-        data = data[16 + length :]
-    chunks = events(tmp_path / "run", "chunk")
-    assert values["episode_length"] == pytest.approx([chunk["episode_length"] for chunk in chunks])
-    assert len(values["validation"]) == 8
-    assert set(values) == {"episode_length", "validation", "steps_per_second"}
 
 
 def test_the_log_says_what_happened(stopped):
