@@ -12,7 +12,7 @@ from uavmec_jax.studies.durable.leases import LeaseLostError, Leases, is_quiet, 
 
 pytestmark = pytest.mark.slow
 
-QUICK = 0.3
+QUICK = 0.8
 
 
 def elsewhere(lease):
