@@ -31,7 +31,7 @@ def main() -> None:
     host.use_every_core()
     from uavmec_jax.files import write_text
     from uavmec_jax.reporting import canvas, figures
-    from uavmec_jax.studies.run import resume_run, run_study
+    from uavmec_jax.studies.run import run_or_resume
     from uavmec_jax.studies.speed import environment_speed
     from uavmec_jax.studies.study import load_study
 
@@ -53,10 +53,7 @@ def main() -> None:
     heuristics = {"evaluation.planners": [], "evaluation.baselines": ["oldest-first"]}
     changes = {"axes.seeds": 1, "steps": 400} | heuristics if quick else {"axes.seeds": 30}
     directory = arguments.out / "table5"
-    if (directory / "plan.json").exists():
-        results = resume_run(directory)
-    else:
-        results = run_study(load_study("table5", changes), directory, command="uavmec run table5 --seeds 30")
+    results = run_or_resume(load_study("table5", changes), directory, command="uavmec run table5 --seeds 30")
     canvas.save(figures.run_figure(results), directory / "figure.png")
     speed, seconds = results.run["training_steps_per_second"], results.run["seconds"]
     print(f"table5: {len(results.agents)} agents, {speed:,} steps/s, {seconds['wall']:,.0f} s in all")

@@ -170,6 +170,15 @@ def read_text(path: Path, error: type[UserError], encoding: str = "utf-8") -> st
         raise error(f"{path}: cannot be read: {reason}") from None
 
 
+def read_facts(path: Path) -> dict[str, Any]:
+    """What a small JSON file says that others may just be writing; nothing if it is not there, or damaged."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
 def parse_toml(text: str, source: object, error: type[UserError]) -> dict[str, Any]:
     """What a TOML file holds; ``source`` names it in messages.
 

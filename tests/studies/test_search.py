@@ -8,8 +8,9 @@ import pytest
 from tests.studies.durable.runs import TINY
 from uavmec_jax.errors import StudyError
 from uavmec_jax.reporting.search import history_figure, importance_figure, search_json, search_tables
+from uavmec_jax.studies.compare import overall, pair
 from uavmec_jax.studies.search.bracket import Brackets
-from uavmec_jax.studies.search.confirm import confirm, gain
+from uavmec_jax.studies.search.confirm import confirm
 from uavmec_jax.studies.search.search import search
 from uavmec_jax.studies.search.space import load_space, settings_of
 from uavmec_jax.studies.study import load_study
@@ -78,7 +79,7 @@ def test_a_search_that_is_stopped_ends_as_one_that_is_not(space, tmp_path):
     own, best = confirm(more, tmp_path / "whole", command="x")
     assert own.results.agents["seed"].unique().tolist() == [0, 1]
     lives = [side.results.agents["best_lifetime"].to_numpy() for side in (own, best)]
-    assert gain(own, best)["difference"][0] == pytest.approx((lives[1] - lives[0]).mean())
+    assert overall(*pair(own, best))["difference"][0] == pytest.approx((lives[1] - lives[0]).mean())
     again, _ = confirm(more, tmp_path / "whole")
     assert again.results.agents.shape == own.results.agents.shape
 

@@ -30,7 +30,7 @@ def search(space: str, trials: int | None, out: Path | None, no_confirm: bool, a
     from uavmec_jax.reporting.compare import comparison
     from uavmec_jax.reporting.search import history_figure, importance_figure, search_json, search_tables
     from uavmec_jax.studies.search import search as searching
-    from uavmec_jax.studies.search.confirm import confirm, gain_json
+    from uavmec_jax.studies.search.confirm import confirm
     from uavmec_jax.studies.search.space import load_space
 
     wanted = load_space(space, {"trials": trials} if trials else None)
@@ -52,9 +52,9 @@ def search(space: str, trials: int | None, out: Path | None, no_confirm: bool, a
                     command=command_line(),
                     on_progress=lambda name, news: line.update(f"{name} settings: {news.steps / news.of_steps:.0%}"),
                 )
-                more, _ = comparison(own, best)
+                more, compared = comparison(own, best)
                 tables |= {f"On towns that the search has not seen. {title}": table for title, table in more.items()}
-                told["gain"] = gain_json(own, best)
+                told["gain"] = compared["overall"]
     except KeyboardInterrupt:
         click.echo(f"interrupted: go on with: uavmec search {space} --out {directory}", err=True)
         sys.exit(130)

@@ -26,7 +26,7 @@ def progress_bar(console: Console, plan: Plan) -> Iterator[Callable[[News], None
     )
     with Progress(*columns, console=console) as bar:
         unit = "steps" if plan.total_steps else "scenarios"
-        task = bar.add_task("compiling", total=plan.total_steps or plan.agents, speed="-", length="-", unit=unit)
+        task = bar.add_task("compiling", total=plan.work, speed="-", length="-", unit=unit)
 
         def report(news: News) -> None:
             speed = bar.tasks[task].speed

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +13,9 @@ from flax import traverse_util
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files import load_arrays
 from uavmec_jax.studies.collection import WEIGHTS, read_collection
-from uavmec_jax.studies.durable.folder import PLAN, SHARDS, RunFolder
+from uavmec_jax.studies.durable.folder import PLAN, RUN, SHARDS, STUDY, RunFolder
 from uavmec_jax.studies.durable.leases import Leases, named
-from uavmec_jax.studies.results import AGENTS, CURVES, EVALUATION, RUN, SCHEMA, STUDY, Results
+from uavmec_jax.studies.results import AGENTS, CURVES, EVALUATION, SCHEMA, Results
 from uavmec_jax.studies.shard import Finished
 from uavmec_jax.studies.study import cell_axes, load_study
 
@@ -48,15 +48,14 @@ def help_with(directory: Path) -> str:
     return f"; to help it, start `uavmec worker {directory}`"
 
 
-def put_together(folder: RunFolder, **more: Any) -> Results:
+def put_together(folder: RunFolder, shards: Iterable[Finished], **more: Any) -> Results:
     """The results of a run whose shards are all finished; the shards' own files are then no longer needed.
 
     However often and by whomever it is done, the files are the same. ``more`` is added to the run's label.
 
     Raises:
-        StudyError: a shard is not finished, or its file is damaged.
+        StudyError: an agent is there twice, or missing.
     """
-    shards = [Finished.read(folder.result(shard)) for shard in folder.plan.shards]
     results = Results.of(folder.study, folder.facts["label"] | more, shards, folder.plan.agents)
     _check_agents(folder, results)
     results.save(folder.path)
@@ -73,27 +72,37 @@ def _check_agents(folder: RunFolder, results: Results) -> None:
         )
 
 
+def finished_shards(folder: RunFolder) -> list[Finished]:
+    """The shards that are finished by now.
+
+    Raises:
+        StudyError: the file of one is damaged.
+    """
+    return [Finished.read(folder.result(shard)) for shard, state, _ in folder.states() if state == "done"]
+
+
 def partial_results(folder: RunFolder) -> Results:
-    """The results of the shards that are finished, by now."""
-    done = [shard for shard, state, _ in folder.states() if state == "done"]
-    shards = [Finished.read(folder.result(shard)) for shard in done]
-    return Results.of(folder.study, folder.facts["label"], shards, folder.plan.agents)
+    """The results of the shards that are finished by now."""
+    return Results.of(folder.study, folder.facts["label"], finished_shards(folder), folder.plan.agents)
 
 
-def set_damaged_aside(folder: RunFolder, tell: Callable[..., None]) -> list[int]:
-    """Check every finished shard; those whose files are damaged are named, set aside and no longer finished."""
-    damaged = []
+def sound_shards(folder: RunFolder, tell: Callable[..., None]) -> tuple[list[Finished], list[int]]:
+    """The shards that are finished, and the numbers of those whose files are damaged.
+
+    The damaged ones are named and set aside; they are no longer finished.
+    """
+    sound, damaged = [], []
     for shard in folder.plan.shards:
         path = folder.result(shard)
         if not path.exists():
             continue
         try:
-            Finished.read(path)
+            sound.append(Finished.read(path))
         except StudyError as error:
             tell("damaged", shard=shard.number, file=path.name, error=str(error))
             path.rename(path.with_suffix(".damaged"))
             damaged.append(shard.number)
-    return damaged
+    return sound, damaged
 
 
 def holds_run(directory: Path) -> bool:

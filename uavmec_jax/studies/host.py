@@ -1,6 +1,7 @@
 """The machine a run happens on: its cores, memory and versions."""
 
 import hashlib
+import importlib
 import os
 import platform
 import sys
@@ -11,6 +12,8 @@ from typing import Any
 
 import jax
 import psutil
+
+from uavmec_jax.errors import StudyError
 
 MEMORY_SHARE = 0.8
 """Share of the free memory that a run may plan with."""
@@ -94,6 +97,20 @@ def describe() -> dict[str, Any]:
         "backend": jax.default_backend(),
         "devices": [f"{device.platform}:{device.id} {device.device_kind}" for device in jax.local_devices()],
     }
+
+
+def optional(module: str, needed_by: str, extra: str) -> Any:
+    """A module of a package that only comes with an extra.
+
+    Raises:
+        StudyError: it is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise StudyError(
+            f"{needed_by} needs the package {module}, which is not installed: pip install 'uavmec-jax[{extra}]'"
+        ) from None
 
 
 def version(name: str) -> str:

@@ -70,6 +70,15 @@ class Plan:
         """Environment steps of all agents."""
         return sum(self.members[name] * self.steps[name] for name in self.blocks)
 
+    @property
+    def work(self) -> int:
+        """What progress is counted in: environment steps, or scenarios where nothing is trained."""
+        return self.total_steps or self.agents
+
+    def work_of(self, shard: Shard) -> int:
+        """A shard's part of :attr:`work`."""
+        return shard.agents * (self.steps[shard.algorithm] or 1)
+
     def __str__(self) -> str:
         if not self.total_steps:
             return f"{self.agents} scenarios, nothing is trained"

@@ -16,6 +16,7 @@ from flax import traverse_util
 from uavmec_jax.files import write_arrays, write_text
 from uavmec_jax.studies import host
 from uavmec_jax.studies.collection import WEIGHTS, Collection, write_collection
+from uavmec_jax.studies.durable.folder import RUN, STUDY
 from uavmec_jax.studies.evaluation import device_number
 from uavmec_jax.studies.places import describe_places
 from uavmec_jax.studies.plan import Plan
@@ -27,8 +28,7 @@ from uavmec_jax.studies.study import cell_axes, seeds_of, study_toml
 SCHEMA = 2
 """Version of the run folder. In version 1 curves and weights did not name their algorithm: it was the DQN."""
 
-STUDY, RUN, AGENTS = "study.toml", "run.json", "agents.csv"
-CURVES, EVALUATION = "curves.npz", "evaluation.npz"
+AGENTS, CURVES, EVALUATION = "agents.csv", "curves.npz", "evaluation.npz"
 
 
 @dataclass

@@ -16,9 +16,9 @@ from uavmec_jax.studies.archive import (
     load_results,
     partial_results,
     put_together,
-    set_damaged_aside,
+    sound_shards,
 )
-from uavmec_jax.studies.durable.folder import SHARDS, Durability, RunFolder
+from uavmec_jax.studies.durable.folder import PLAN, SHARDS, Durability, RunFolder
 from uavmec_jax.studies.durable.leases import Leases
 from uavmec_jax.studies.durable.log import writer_class
 from uavmec_jax.studies.durable.stopping import Stop
@@ -137,6 +137,15 @@ def resume_run(
         lease.release()
 
 
+def run_or_resume(
+    study: Study, directory: str | Path, *, command: str | None = None, on_progress: OnProgress = lambda _: None
+) -> Results:
+    """Run a study in a folder, or go on with the run that is there; one that is complete is read."""
+    if (Path(directory) / PLAN).exists():
+        return resume_run(directory, on_progress=on_progress)
+    return run_study(study, directory, command=command, on_progress=on_progress)
+
+
 def _run(
     path: Path,
     bench: Bench,
@@ -156,7 +165,8 @@ def _run(
                     work_together(folder, workers, stop, on_progress, worker.log.tell)
                 else:
                     worker.work()
-                if not (damaged := set_damaged_aside(folder, worker.log.tell)):
+                finished, damaged = sound_shards(folder, worker.log.tell)
+                if not damaged:
                     break
                 worker.forget(damaged)
         except KeyboardInterrupt as order:
@@ -174,7 +184,7 @@ def _run(
                 f"{path}: {len(failed)} of {len(folder.plan.shards)} shards failed, shard {shard.number} with "
                 f"{facts.get('error', 'an unknown error')} ({folder.failure(shard)}); `uavmec resume {path}` tries them again"
             )
-        return put_together(folder, **label)
+        return put_together(folder, finished, **label)
 
 
 def _run_in_memory(study: Study, plan: Plan, bench: Bench, label: dict, on_progress: OnProgress) -> Results:
@@ -184,18 +194,17 @@ def _run_in_memory(study: Study, plan: Plan, bench: Bench, label: dict, on_progr
     interrupted = False
     try:
         for shard in plan.shards:
-            of_steps = plan.total_steps or plan.agents
             tick = time.perf_counter()
             training = bench.start(shard)
             while training is not None and not training.finished:
                 training.advance()
                 steps = steps_before + shard.agents * training.steps
-                on_progress(Progress(shard.number, steps, of_steps, training.mean_length))
+                on_progress(Progress(shard.number, steps, plan.work, training.mean_length))
             finished.append(bench.finish(shard, training))
             finished[-1].seconds["wall"] = time.perf_counter() - tick
-            steps_before += shard.agents * (plan.steps[shard.algorithm] or 1)
+            steps_before += plan.work_of(shard)
             if training is None:
-                on_progress(Progress(shard.number, steps_before, of_steps, float("nan")))
+                on_progress(Progress(shard.number, steps_before, plan.work, float("nan")))
     except KeyboardInterrupt:
         interrupted = True
     results = Results.of(study, label, finished, plan.agents)

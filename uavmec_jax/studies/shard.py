@@ -121,7 +121,7 @@ class Bench:
         return self._parts[shard.algorithm].who[shard.first : shard.first + shard.agents]
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Part:
     """The agents of one algorithm of a study, or those that nothing trains."""
 
@@ -130,6 +130,8 @@ class _Part:
     named: bool
     """Whether the table names the algorithm."""
     reward: Reward | None
+    trainer: Trainer | None = None
+    """Compiled for the first shard."""
 
     @cached_property
     def who(self) -> Who:
@@ -146,25 +148,19 @@ class _Part:
         who = who + [who[-1]] * (size - shard.agents)
         return who, make_agents(self.study, self.reward, who)
 
-    @cached_property
-    def _trainers(self) -> dict[str, Trainer]:
-        return {}
-
     def start(self, shard: Shard) -> Training | None:
         if self.algorithm is None:
             return None
         who, agents = self.members(shard)
         keys = validation_keys(self.study, who)
-        compiled = self._trainers.get("only")
-        if compiled is None:
-            settings = self.study.evaluation
-            validation = Validation(every=settings.validate_every, draws=settings.validation_draws)
-            blocks = self.plan.blocks[self.study.algorithm]
-            compiled = self._trainers["only"] = Trainer.compile(self.algorithm, agents, keys, validation, blocks)
-            training = compiled.start(agents, keys)
-            training.seconds["compile"] = compiled.compile_seconds
-            return training
-        return compiled.start(agents, keys)
+        if self.trainer is not None:
+            return self.trainer.start(agents, keys)
+        settings, blocks = self.study.evaluation, self.plan.blocks[self.study.algorithm]
+        validation = Validation(every=settings.validate_every, draws=settings.validation_draws)
+        self.trainer = Trainer.compile(self.algorithm, agents, keys, validation, blocks)
+        training = self.trainer.start(agents, keys)
+        training.seconds["compile"] = self.trainer.compile_seconds
+        return training
 
     def finish(self, shard: Shard, training: Training | None) -> Finished:
         tick = time.perf_counter()

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from uavmec_jax.errors import StudyError
-from uavmec_jax.studies.archive import check_directory, check_empty, help_with, put_together
+from uavmec_jax.studies.archive import check_directory, check_empty, finished_shards, help_with, put_together
 from uavmec_jax.studies.durable.folder import SHARDS, Durability, RunFolder
 from uavmec_jax.studies.durable.leases import Leases
 from uavmec_jax.studies.durable.stopping import Stop
@@ -89,6 +89,6 @@ def _put_together_alone(worker: Worker) -> None:
         return
     try:
         if not worker.folder.complete:
-            put_together(worker.folder)
+            put_together(worker.folder, finished_shards(worker.folder))
     finally:
         lease.release()

@@ -6,13 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from uavmec_jax.errors import StudyError
+from uavmec_jax.studies import host
 
 
 def submit_workers(prepare: Callable[[], Path], jobs: int, executor: str, parameters: Mapping[str, Any]) -> list[str]:
     """Submit workers as one array of jobs, and return their names.
 
     Args:
-        prepare: plans the run and returns its folder; called once submitit is known to be able to submit.
+        prepare: plans the run and returns its folder; called once submitit is known to take executor and parameters.
         jobs: workers.
         executor: of submitit: ``slurm``, ``local``, ``debug``.
         parameters: for ``AutoExecutor.update_parameters``, e.g. ``timeout_min``, ``cpus_per_task``, ``slurm_partition``.
@@ -20,29 +21,27 @@ def submit_workers(prepare: Callable[[], Path], jobs: int, executor: str, parame
     Raises:
         StudyError: submitit is not installed, or knows no such executor or parameter.
     """
-    try:
-        import submitit
-    except ImportError:
-        raise StudyError(
-            "submit needs the package submitit, which is not installed: pip install 'uavmec-jax[cluster]'"
-        ) from None
-    try:
-        submitit.AutoExecutor(folder=tempfile.gettempdir(), cluster=executor)
-    except (RuntimeError, ValueError) as error:
-        raise StudyError(f"--executor {executor}: {error}") from None
+    submitit = host.optional("submitit", "submit", "cluster")
+
+    def queue(folder: Path) -> Any:
+        try:
+            made = submitit.AutoExecutor(folder=folder, cluster=executor)
+        except (RuntimeError, ValueError) as error:
+            raise StudyError(f"--executor {executor}: {error}") from None
+        try:
+            made.update_parameters(name="uavmec", **parameters)
+        except (NameError, TypeError, AssertionError) as error:
+            raise StudyError(f"--with: {error}") from None
+        return made
+
+    queue(Path(tempfile.gettempdir()))
     directory = prepare()
-    queue = submitit.AutoExecutor(folder=directory / "log" / "jobs", cluster=executor)
-    try:
-        queue.update_parameters(name="uavmec", **parameters)
-    except (NameError, TypeError, AssertionError) as error:
-        raise StudyError(f"--with: {error}") from None
-    return [job.job_id for job in queue.map_array(_work, [str(directory)] * jobs)]
+    jobs_of_run = queue(directory / "log" / "jobs")
+    return [job.job_id for job in jobs_of_run.map_array(_work, [str(directory)] * jobs)]
 
 
 def _work(directory: str) -> bool:
     """What runs on a node: one worker with the cores that the scheduler gave it."""
-    from uavmec_jax.studies import host
-
     host.use_every_core()
     from uavmec_jax.studies.shared_run import work_on
 

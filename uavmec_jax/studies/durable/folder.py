@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from uavmec_jax.errors import StudyError
-from uavmec_jax.files import read_text, write_text
+from uavmec_jax.files import read_facts, read_text, write_text
 from uavmec_jax.learning.blocks import Blocks
 from uavmec_jax.studies import host
 from uavmec_jax.studies.durable.leases import LEASE_S, is_quiet, read_lease
@@ -179,20 +179,11 @@ class RunFolder:
             if complete or self.result(shard).exists():
                 yield shard, "done", {}
             elif self.failure(shard).exists():
-                yield shard, "failed", _loaded(self.failure(shard))
+                yield shard, "failed", read_facts(self.failure(shard))
             elif lease := read_lease(self.shard_folder(shard)):
                 yield shard, "stopped" if is_quiet(lease, self.durability.lease_s) else "running", lease
             else:
                 yield shard, "waiting", {}
-
-
-def _loaded(path: Path) -> dict[str, Any]:
-    """What a small file says, as far as it can be read."""
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return found if isinstance(found, dict) else {}
 
 
 def _sha256(text: str) -> str:

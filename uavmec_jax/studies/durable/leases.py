@@ -20,7 +20,7 @@ from typing import Any
 import psutil
 
 from uavmec_jax.errors import StudyError
-from uavmec_jax.files import whole
+from uavmec_jax.files import read_facts, whole
 
 LEASE_S = 60.0
 """Seconds without a beat after which a holder on another machine counts as dead."""
@@ -81,7 +81,7 @@ class Lease:
             LeaseLostError: somebody else has taken over.
         """
         if _file(self.folder, self.number + 1).exists() or not self.path.exists():
-            raise LeaseLostError(f"{self.folder}: {named(_read(self.folder, _latest(self.folder)))} has taken over")
+            raise LeaseLostError(f"{self.folder}: {named(read_lease(self.folder))} has taken over")
 
     def release(self) -> None:
         """Let go: whoever comes next need not wait."""
@@ -139,7 +139,7 @@ class Leases:
         if content != before:
             self._seen[path] = (content, now)
             since = now
-        holder = _read(folder, latest)
+        holder = read_facts(path)
         dead = _is_known_dead(holder) or holder.get("released") or now - since > self.lease_s
         return None if dead else holder
 
@@ -200,19 +200,10 @@ def _latest(folder: Path) -> int:
     return max((int(path.stem.removeprefix("lease-")) for path in folder.glob("lease-[0-9]*.json")), default=0)
 
 
-def _read(folder: Path, number: int) -> dict[str, Any]:
-    """What a claim's file says; nothing if it is damaged or just being made."""
-    try:
-        found = json.loads(_file(folder, number).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return found if isinstance(found, dict) else {}
-
-
 def read_lease(folder: Path) -> dict[str, Any]:
     """What the latest claim's file says, whether it still holds or not; empty if there is none."""
     latest = _latest(folder)
-    return _read(folder, latest) if latest else {}
+    return read_facts(_file(folder, latest)) if latest else {}
 
 
 def is_quiet(lease: dict[str, Any], lease_s: float) -> bool:

@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from uavmec_jax.errors import StudyError
+from uavmec_jax.studies import host
 
 
 class Log:
@@ -69,10 +69,4 @@ def writer_class() -> Any:
     Raises:
         StudyError: it is not installed.
     """
-    try:
-        from tensorboardX import SummaryWriter
-    except ImportError:
-        raise StudyError(
-            "--tensorboard needs the package tensorboardX, which is not installed: pip install 'uavmec-jax[tensorboard]'"
-        ) from None
-    return SummaryWriter
+    return host.optional("tensorboardX", "--tensorboard", "tensorboard").SummaryWriter

@@ -57,7 +57,7 @@ def run_status(directory: str | Path) -> Status:
     for shard, state, facts in folder.states():
         counts[state] += 1
         if state == "done":
-            steps += shard.agents * (plan.steps[shard.algorithm] or 1)
+            steps += plan.work_of(shard)
         elif state == "failed":
             failures[shard.number] = str(facts.get("error", "an unknown error"))
         else:
@@ -65,7 +65,6 @@ def run_status(directory: str | Path) -> Status:
         if state == "running":
             speed += float(facts.get("speed", 0.0))
             workers.append(f"shard {shard.number}: {named(facts)}")
-    of_steps = plan.total_steps or plan.agents
     files = (file for file in folder.path.rglob("*") if file.is_file())
     return Status(
         directory=str(directory),
@@ -73,9 +72,9 @@ def run_status(directory: str | Path) -> Status:
         agents=plan.agents,
         shards=dict(counts),
         steps=steps,
-        of_steps=of_steps,
+        of_steps=plan.work,
         steps_per_second=speed,
-        seconds_left=(of_steps - steps) / speed if speed else None,
+        seconds_left=(plan.work - steps) / speed if speed else None,
         disk_bytes=sum(_size(file) for file in files),
         workers=workers,
         failures=failures,

@@ -63,8 +63,8 @@ def team_progress(folder: RunFolder) -> Progress:
     plan, steps, over = folder.plan, 0, 0
     for shard, state, facts in folder.states():
         if state in ("done", "failed"):
-            steps += shard.agents * (plan.steps[shard.algorithm] or 1)
+            steps += plan.work_of(shard)
             over += 1
         else:
             steps += int(facts.get("steps", 0))
-    return Progress(max(over - 1, 0), steps, plan.total_steps or plan.agents, float("nan"))
+    return Progress(max(over - 1, 0), steps, plan.work, float("nan"))

@@ -47,8 +47,8 @@ class Worker:
     log: Log
     on_progress: OnProgress = lambda _: None
     leases: Leases = field(default_factory=Leases)
-    _over: set[int] = field(default_factory=set)
-    _done_steps: int = 0
+    _over: dict[int, int] = field(default_factory=dict)
+    """Shard -> the work that was done in it, of those that are finished or have failed."""
 
     def work(self, *, wait: bool = True) -> None:
         """Until every shard is finished or has failed; without ``wait``, until none is free.
@@ -69,14 +69,13 @@ class Worker:
 
     def forget(self, shards: Iterable[int]) -> None:
         """These shards are not over after all."""
-        self._over -= set(shards)
+        for number in shards:
+            self._over.pop(number, None)
 
     def _claim(self) -> tuple[Shard, Lease] | None:
         """The first shard that nobody works on."""
         for shard in self.folder.plan.shards:
-            if shard.number in self._over:
-                continue
-            if self._is_over(shard):
+            if shard.number in self._over or self._is_over(shard):
                 continue
             place = self.folder.shard_folder(shard)
             again = self.leases.taken_over(place)
@@ -90,11 +89,10 @@ class Worker:
 
     def _is_over(self, shard: Shard) -> bool:
         if self.folder.complete or self.folder.result(shard).exists():
-            self._done_steps += shard.agents * (self.folder.plan.steps[shard.algorithm] or 1)
-        elif not self.folder.failure(shard).exists():
-            return False
-        self._over.add(shard.number)
-        return True
+            self._over[shard.number] = self.folder.plan.work_of(shard)
+        elif self.folder.failure(shard).exists():
+            self._over[shard.number] = 0
+        return shard.number in self._over
 
     def _do(self, shard: Shard, lease: Lease) -> None:
         tick = time.monotonic()
@@ -158,7 +156,7 @@ class Worker:
     def _report(self, shard: Shard, lease: Lease, training: Training) -> None:
         steps = shard.agents * training.steps
         speed = steps / max(training.seconds["train"] + training.seconds["validate"], 1e-9)
-        lease.news.update(steps=steps, of_steps=shard.agents * self.folder.plan.steps[shard.algorithm], speed=speed)
+        lease.news.update(steps=steps, speed=speed)
         values = {"episode_length": training.mean_length, "steps_per_second": speed}
         if training.looked:
             values["validation"] = float(training.scores[-1][: shard.agents].mean())
@@ -166,8 +164,7 @@ class Worker:
         self.on_progress(self._progress(shard, steps, training.mean_length))
 
     def _progress(self, shard: Shard, steps: int, mean_length: float) -> Progress:
-        plan = self.folder.plan
-        return Progress(shard.number, self._done_steps + steps, plan.total_steps or plan.agents, mean_length)
+        return Progress(shard.number, sum(self._over.values()) + steps, self.folder.plan.work, mean_length)
 
     def _snapshots(self, shard: Shard) -> Snapshots:
         durability = self.folder.durability

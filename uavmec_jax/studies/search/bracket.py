@@ -19,9 +19,9 @@ from uavmec_jax.learning.training import Trainer, Training, Validation
 from uavmec_jax.studies import host
 from uavmec_jax.studies.evaluation import judge_learned
 from uavmec_jax.studies.schema import Study
-from uavmec_jax.studies.search.space import REWARD, Space, reward_terms
+from uavmec_jax.studies.search.space import REWARD, Space, reward_with
 from uavmec_jax.studies.statistics import mean_interval
-from uavmec_jax.studies.study import evaluation_keys, identities, make_agents, make_algorithm, validation_keys
+from uavmec_jax.studies.study import Who, evaluation_keys, identities, make_agents, make_algorithm, validation_keys
 from uavmec_jax.world.rewards import make_reward
 
 Values = Mapping[str, Any]
@@ -64,10 +64,15 @@ class Brackets:
         evaluation = base.evaluation.model_copy(update={"draws": towns.draws})
         return base.model_copy(update={"axes": kept | cells | {"seeds": seeds}, "evaluation": evaluation})
 
+    @cached_property
+    def who(self) -> Who:
+        """The agents of one trial: one on each town."""
+        return identities(self.study)
+
     @property
     def towns(self) -> int:
         """Agents of one trial."""
-        return len(identities(self.study))
+        return len(self.who)
 
     def run(self, trials: Sequence[Values]) -> list[Outcome]:
         """Train and judge a batch. What shapes the program is the same for all of its trials.
@@ -90,18 +95,17 @@ class Brackets:
                 n = max(1, round(self.space.halving.keep * len(left)))
                 best = np.sort(np.argsort(-scores, kind="stable")[:n])
                 left = [left[k] for k in best]
-                members = (best[:, None] * self.towns + np.arange(self.towns)).ravel()
-                trainings = regroup(trainings, members)
-        values = dict(zip(left, self._judged([trials[k] for k in left], trainings, algorithm), strict=True))
+                trainings = regroup(trainings, self._members(best))
+        agents = jax.tree.map(lambda leaf: leaf[self._members(left)], agents)
+        values = dict(zip(left, self._judged(agents, trainings, algorithm), strict=True))
         return [Outcome(values.get(k), rungs[k]) for k in range(len(trials))]
 
     def _population(self, trials: Sequence[Values]) -> tuple[Agent, Any, Algorithm]:
         """Trials x towns: agents, validation draws, and the algorithm of the batch."""
-        who = identities(self.study)
         study = self._shaped(trials[0])
-        every = who * len(trials)
+        every = self.who * len(trials)
         agents = make_agents(study, who=every)
-        per_agent = [trial for trial in trials for _ in who]
+        per_agent = [trial for trial in trials for _ in self.who]
         hyper = {
             name: jnp.asarray([trial[name] for trial in per_agent], getattr(agents.hyper, name).dtype)
             for name in vars(agents.hyper)
@@ -109,14 +113,8 @@ class Brackets:
         }
         agents = replace(agents, hyper=replace(agents.hyper, **hyper))
         if any(key.startswith(REWARD) for key in trials[0]):
-            own = reward_terms(study)
-            rewards = [
-                make_reward(
-                    own | {k.removeprefix(REWARD): v for k, v in trial.items() if k.startswith(REWARD)}, study.guard
-                )
-                for trial in trials
-            ]
-            weights = jnp.repeat(jnp.stack([reward.weights for reward in rewards]), len(who), axis=0)
+            rewards = [make_reward(reward_with(study, trial), study.guard) for trial in trials]
+            weights = jnp.repeat(jnp.stack([reward.weights for reward in rewards]), self.towns, axis=0)
             scenario = replace(agents.scenario, reward=replace(agents.scenario.reward, weights=weights))
             agents = replace(agents, scenario=scenario)
         algorithm = make_algorithm(study)
@@ -177,16 +175,19 @@ class Brackets:
         """``[trials]`` means over the towns."""
         return values[: n * self.towns].reshape(n, self.towns).mean(axis=1)
 
-    def _judged(self, trials: Sequence[Values], trainings: list[Training], algorithm: Algorithm) -> list[float]:
+    def _members(self, trials: Sequence[int] | np.ndarray) -> np.ndarray:
+        """Places of the agents of some trials in the population."""
+        return (np.asarray(trials)[:, None] * self.towns + np.arange(self.towns)).ravel()
+
+    def _judged(self, agents: Agent, trainings: list[Training], algorithm: Algorithm) -> list[float]:
         """The objective of trials that are trained to the end, on draws that no look has seen."""
-        agents, _, _ = self._population(trials)
-        keys = evaluation_keys(self.study, identities(self.study) * len(trials))
-        n, size = keys.shape[0], trainings[0].trainer.blocks.size
+        n, size = agents.key.shape[0], trainings[0].trainer.blocks.size
+        keys = evaluation_keys(self.study, self.who * (n // self.towns))
         sizes = [min(size, n - k * size) for k in range(len(trainings))]
         pieces = [training.weights(size)["best"] for training, size in zip(trainings, sizes, strict=True)]
         best = jax.tree.map(lambda *leaves: np.concatenate(leaves), *pieces)
         lifetimes = judge_learned(algorithm, agents, keys, {"best": best})["best"].mean_lifetime
-        per_trial = lifetimes.reshape(len(trials), self.towns)
+        per_trial = lifetimes.reshape(-1, self.towns)
         if self.space.objective == "mean":
             return [float(mean) for mean in per_trial.mean(axis=1)]
         return [mean_interval(own)[1] for own in per_trial]

@@ -2,14 +2,10 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from uavmec_jax.learning.population import Progress
-from uavmec_jax.studies.archive import load_results
-from uavmec_jax.studies.compare import Side, overall, pair
-from uavmec_jax.studies.results import Results
-from uavmec_jax.studies.run import resume_run, run_study
-from uavmec_jax.studies.schema import Study
+from uavmec_jax.studies.compare import Side
+from uavmec_jax.studies.run import run_or_resume
 from uavmec_jax.studies.search.search import Found, best_study
 from uavmec_jax.studies.study import load_study
 
@@ -31,6 +27,9 @@ def confirm(
         directory: of the search; the runs are kept in ``own`` and ``best`` there.
         command: the command line, for the labels.
         on_progress: told ``(own or best, progress)``.
+
+    Raises:
+        KeyboardInterrupt: a signal came; what was trained is kept.
     """
     space = found.space
     seeds = {"axes.seeds": space.confirm_seeds}
@@ -43,28 +42,8 @@ def confirm(
         def report(news: Progress, name: str = name) -> None:
             on_progress(name, news)
 
-        sides.append(Side(_run(study, Path(directory) / name, command, report)))
+        results = run_or_resume(study, Path(directory) / name, command=command, on_progress=report)
+        if not results.run["complete"]:
+            raise KeyboardInterrupt
+        sides.append(Side(results))
     return sides[0], sides[1]
-
-
-def _run(study: Study, path: Path, command: str | None, report: Callable[[Progress], None]) -> Results:
-    if (path / "run.json").exists():
-        return load_results(path)
-    if (path / "plan.json").exists():
-        results = resume_run(path, on_progress=report)
-    else:
-        results = run_study(study, path, command=command, on_progress=report)
-    if not results.run["complete"]:
-        raise KeyboardInterrupt
-    return results
-
-
-def gain(own: Side, best: Side) -> dict[str, tuple[float, float, float]]:
-    """See :func:`uavmec_jax.studies.compare.overall`: ``difference`` is what the best settings live longer, in slots."""
-    both, cells = pair(own, best)
-    return overall(both, cells)
-
-
-def gain_json(own: Side, best: Side) -> dict[str, Any]:
-    """The gain as plain data."""
-    return {name: dict(zip(("value", "low", "high"), one, strict=True)) for name, one in gain(own, best).items()}

@@ -123,12 +123,7 @@ def best_study(found: Found) -> Any:
 
 
 def _optuna() -> Any:
-    try:
-        import optuna
-    except ImportError:
-        raise StudyError(
-            "search needs the package optuna, which is not installed: pip install 'uavmec-jax[search]'"
-        ) from None
+    optuna = host.optional("optuna", "search", "search")
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     return optuna
 
@@ -179,7 +174,7 @@ def _proposed(optuna: Any, trials: "optuna.Study", space: Space, batch: int) -> 
     what it would have proposed. The outer settings are the same for all of a batch: the first batches have one
     combination each, until all were tried; later ones have what the sampler chooses for their first trial.
     """
-    combinations = outer_combinations(space)
+    names, combinations, own = outer(space), outer_combinations(space), own_settings(space)
     size = min(space.batch, space.trials - batch * space.batch)
     members = [trial for trial in trials.get_trials(deepcopy=False) if trial.user_attrs.get(_BATCH) == batch]
     while len(members) < size:
@@ -187,16 +182,20 @@ def _proposed(optuna: Any, trials: "optuna.Study", space: Space, batch: int) -> 
         sampler = optuna.samplers.TPESampler(
             seed=space.seed * 1_000_003 + number, multivariate=True, n_startup_trials=space.batch
         )
-        if members or batch < len(combinations):
-            fixed = {key: members[0].params[key] for key in outer(space)} if members else combinations[batch]
-            fixed = {key: _told(value) for key, value in fixed.items()}
+        if members:
+            fixed = {key: members[0].params[key] for key in names}
+        else:
+            fixed = (
+                {key: _told(value) for key, value in combinations[batch].items()} if batch < len(combinations) else {}
+            )
+        if fixed:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-                sampler = optuna.samplers.PartialFixedSampler(fixed, sampler) if fixed else sampler
+                sampler = optuna.samplers.PartialFixedSampler(fixed, sampler)
         trials.sampler = sampler
         trial = trials.ask()
         for key, values in space.space.items():
-            _suggest(trial, key, values, own_settings(space)[key])
+            _suggest(trial, key, values, own[key])
         trial.set_user_attr(_BATCH, batch)
         members.append(trials.get_trials(deepcopy=False)[trial.number])
     return sorted(members, key=lambda trial: trial.number)

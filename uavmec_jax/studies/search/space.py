@@ -224,13 +224,19 @@ def plain(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
+def reward_with(study: Study, values: Mapping[str, Any]) -> dict[str, float]:
+    """The weights of a study's reward with those among a trial's values."""
+    searched = {key.removeprefix(REWARD): float(value) for key, value in values.items() if key.startswith(REWARD)}
+    return reward_terms(study) | searched
+
+
 def settings_of(space: Space, values: Mapping[str, Any]) -> dict[str, Any]:
     """A trial's values as changes of the study, by dotted names."""
     study = space.base()
     name = study.algorithms[0]
     changes = {f"{name}.{key}": value for key, value in values.items() if not key.startswith(REWARD)}
-    terms = {key.removeprefix(REWARD): float(value) for key, value in values.items() if key.startswith(REWARD)}
-    return dict(space.change) | changes | ({"reward": reward_terms(study) | terms} if terms else {})
+    reward = {"reward": reward_with(study, values)} if any(key.startswith(REWARD) for key in values) else {}
+    return dict(space.change) | changes | reward
 
 
 def digest(space: Space) -> str:
