@@ -1,8 +1,11 @@
 """Small worlds whose numbers can be worked out by hand."""
 
+import jax
 import jax.numpy as jnp
 
-from uavmec_jax.world.layout import Layout
+from uavmec_jax.world.layout import Layout, sample_layout
+from uavmec_jax.world.params import Params
+from uavmec_jax.world.physics import State
 
 
 def three_devices(has_power=(False, False, False), has_comms=(False, False, False), **changes) -> Layout:
@@ -19,3 +22,19 @@ def three_devices(has_power=(False, False, False), has_comms=(False, False, Fals
         "processing_rate": jnp.array([10_000.0, 10_000.0, 10_000.0]),
     }
     return Layout(**{**fields, **changes})
+
+
+def mid_life(seed, n, **params):
+    """A random town of ``n`` devices and a state in the middle of its life."""
+    given = Params(n_devices=n, **params)
+    layout = sample_layout(jax.random.key(seed), given, n // 2, n // 3)
+    k_battery, k_age, k_place = jax.random.split(jax.random.key(100 + seed), 3)
+    state = State(
+        battery=layout.capacity * jax.random.uniform(k_battery, (n,), minval=0.2),
+        age=jnp.where(layout.has_comms, 0, jax.random.randint(k_age, (n,), 0, 9)),
+        uav_position=layout.position[jax.random.randint(k_place, (), 0, n)],
+        uav_energy=jnp.float32(900_000.0),
+        slot=jnp.int32(8),
+        elapsed=jnp.float32(4_000.0),
+    )
+    return given, layout, state

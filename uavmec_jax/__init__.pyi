@@ -1,5 +1,6 @@
 from .errors import LayoutError as LayoutError
 from .errors import PolicyError as PolicyError
+from .errors import StateError as StateError
 from .errors import StudyError as StudyError
 from .errors import TrafficError as TrafficError
 from .learning.a2c import A2CHyper as A2CHyper
@@ -11,10 +12,15 @@ from .learning.dqn import DQNSpec as DQNSpec
 from .learning.ppo import PPOHyper as PPOHyper
 from .learning.ppo import PPOSpec as PPOSpec
 from .learning.training import Validation as Validation
+from .planning.advice import Advice as Advice
+from .planning.advice import advise as advise
 from .planning.beam import beam_search as beam_search
 from .planning.bound import upper_bound as upper_bound
 from .planning.heuristics import HEURISTICS as HEURISTICS
 from .planning.lookahead import rollout_planner as rollout_planner
+from .planning.observation import FEATURES as FEATURES
+from .planning.observation import Observation as Observation
+from .planning.observation import observe_devices as observe_devices
 from .planning.outlook import Outlook as Outlook
 from .planning.outlook import look_ahead as look_ahead
 from .studies.archive import load_results as load_results
@@ -39,6 +45,8 @@ from .traffic.build import build_evacuation as build_evacuation
 from .traffic.evacuation import Evacuation as Evacuation
 from .traffic.evacuation import load_evacuation as load_evacuation
 from .traffic.place import load_place as load_place
+from .world.distribution import ScenarioDistribution as ScenarioDistribution
+from .world.distribution import sample_scenario as sample_scenario
 from .world.environment import Scenario as Scenario
 from .world.environment import UavMecEnv as UavMecEnv
 from .world.environment import advance as advance
@@ -49,6 +57,7 @@ from .world.inventory_files import load_inventory as load_inventory
 from .world.layout import Layout as Layout
 from .world.layout import Traffic as Traffic
 from .world.layout import make_layout as make_layout
+from .world.layout import pad_layout as pad_layout
 from .world.layout import sample_layout as sample_layout
 from .world.params import Params as Params
 from .world.physics import Cause as Cause
@@ -64,3 +73,4 @@ from .world.rollout import Episode as Episode
 from .world.rollout import rollout as rollout
 from .world.rollout import rollouts as rollouts
 from .world.rollout import volume_table as volume_table
+from .world.state_files import load_state as load_state

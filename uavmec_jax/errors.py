@@ -17,5 +17,9 @@ class PolicyError(UserError):
     """A saved policy, or what it is asked, is not usable."""
 
 
+class StateError(UserError):
+    """The state of a network does not fit its layout."""
+
+
 class TrafficError(UserError):
     """A road network, a place, a device file or an evacuation is not usable, or SUMO is not there or failed."""

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 
 from tests.learning.agents import make_agent, stack, take
-from uavmec_jax.learning import a2c, on_policy, ppo
+from uavmec_jax.learning import a2c, estimates, experience, on_policy, ppo
 from uavmec_jax.learning.algorithm import AGENTS_AXIS
 from uavmec_jax.world.environment import observe
 from uavmec_jax.world.params import Params
@@ -41,11 +41,11 @@ def population(name, *hypers):
 
 def test_actions_are_drawn_from_the_softmax():
     scores = jnp.tile(jnp.log(jnp.array([[0.5, 0.2, 0.0, 0.3]])), (20_000, 1))
-    actions = np.asarray(on_policy.choose(scores, jax.random.uniform(jax.random.key(0), (20_000,))))
+    actions = np.asarray(estimates.choose(scores, jax.random.uniform(jax.random.key(0), (20_000,))))
     counts = np.bincount(actions, minlength=4)
     assert counts[2] == 0
     assert stats.chisquare(counts[[0, 1, 3]], [10_000, 4_000, 6_000]).pvalue > 1e-3
-    edges = on_policy.choose(scores[:2], jnp.array([0.0, 1.0 - 2.0**-24]))
+    edges = estimates.choose(scores[:2], jnp.array([0.0, 1.0 - 2.0**-24]))
     assert_array_equal(edges, [0, 3])
 
 
@@ -54,7 +54,7 @@ def test_a_rollout_plays_the_environment():
     spec = a2c.A2CSpec(n_steps=40, n_envs=3)
     agent = make_agent(0, kind=a2c.A2CHyper)
     state = on_policy.init(spec, a2c._OPTIMIZER, agent)
-    play = jax.jit(jax.vmap(functools.partial(on_policy.play, spec), axis_name=AGENTS_AXIS))
+    play = jax.jit(jax.vmap(functools.partial(experience.play, spec), axis_name=AGENTS_AXIS))
     after, samples = take(play(*stack([(agent, state, jax.random.key(5))])), 0)
     observation = samples.observation.reshape(40, 3, 24)
     fresh = observe(agent.scenario.layout, initial_state(agent.scenario.params, agent.scenario.layout))
@@ -75,7 +75,7 @@ def test_a_cut_off_episode_is_bootstrapped():
     weighty = {"gamma": 0.5, "gae_lambda": 1.0}
     limited, free = (make_agent(0, params=Params(max_slots=limit), kind=a2c.A2CHyper, **weighty) for limit in (1, 1000))
     state = on_policy.init(spec, a2c._OPTIMIZER, limited)
-    play = jax.jit(jax.vmap(functools.partial(on_policy.play, spec), axis_name=AGENTS_AXIS))
+    play = jax.jit(jax.vmap(functools.partial(experience.play, spec), axis_name=AGENTS_AXIS))
     _, cut = take(play(*stack([(limited, state, jax.random.key(5))])), 0)
     _, whole = take(play(*stack([(free, state, jax.random.key(5))])), 0)
     # the first slot is the same for both; what it led to is what the free one sees next
@@ -113,10 +113,10 @@ def test_diverged_agent_is_frozen_marked_and_touches_nobody(name, bad):
 
 
 def test_advantage_of_one_sample_stays_as_it_is():
-    assert_array_equal(on_policy.normalized(jnp.array([3.0]), True), [3.0])
+    assert_array_equal(estimates.normalized(jnp.array([3.0]), True), [3.0])
     values = jnp.array([1.0, 2.0, 6.0])
-    assert_array_equal(on_policy.normalized(values, False), values)
-    assert_allclose(on_policy.normalized(values, True), (values - 3) / np.std([1, 2, 6], ddof=1), rtol=1e-5)
+    assert_array_equal(estimates.normalized(values, False), values)
+    assert_allclose(estimates.normalized(values, True), (values - 3) / np.std([1, 2, 6], ddof=1), rtol=1e-5)
 
 
 def test_minibatch_must_divide_the_rollout():

@@ -12,9 +12,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 
 from tests.learning.agents import make_agent, stack
-from uavmec_jax.learning import a2c, dqn, on_policy, ppo
+from uavmec_jax.learning import a2c, dqn, estimates, on_policy, ppo
 from uavmec_jax.learning.algorithm import AGENTS_AXIS
-from uavmec_jax.learning.on_policy import Samples
+from uavmec_jax.learning.experience import Samples
 from uavmec_jax.learning.optimizers import Descent, clipped_adam, clipped_rmsprop, global_norm
 from uavmec_jax.learning.replay import Transition
 
@@ -151,12 +151,12 @@ def test_values_log_probabilities_and_advantages(name, gae_lambda, place):
         weights, spec, hyper = tree(theirs, "weights_0", ACTOR_CRITIC_LAYERS), ppo.PPOSpec(), ppo.PPOHyper()
         assert_allclose(on_policy.value(spec, hyper, weights, rollout.observation), at("values"), rtol=1e-4, atol=1e-5)
         scores = on_policy.logits(spec, hyper, weights, rollout.observation)
-        assert_allclose(on_policy.log_probability(scores, rollout.action)[0], at("log_probs"), rtol=1e-5)
+        assert_allclose(estimates.log_probability(scores, rollout.action)[0], at("log_probs"), rtol=1e-5)
     # SB3 notes where an episode starts; it ended the slot before. The value after the last slot follows from its advantage.
     ended = np.append(at("episode_starts")[1:], 0).astype(bool)
     last_value = (at("advantages")[-1] - at("rewards")[-1] + at("values")[-1]) / 0.98
     columns = (jnp.asarray(at(key))[:, None] for key in ("rewards", "values"))
-    found = on_policy.advantages(*columns, jnp.array([last_value]), jnp.asarray(ended)[:, None], 0.98, gae_lambda)
+    found = estimates.advantages(*columns, jnp.array([last_value]), jnp.asarray(ended)[:, None], 0.98, gae_lambda)
     assert_allclose(found[:, 0], at("advantages"), rtol=1e-4, atol=1e-4)
     assert_allclose(rollout.returns, at("advantages") + at("values"), rtol=1e-6)
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from uavmec_jax.planning.heuristics import HEURISTICS, oldest_first
+from uavmec_jax.planning.observation import FEATURES, observe_devices
 from uavmec_jax.world.environment import UavMecEnv, make_scenario, observe
 from uavmec_jax.world.layout import sample_layout
 from uavmec_jax.world.params import Params
@@ -199,3 +200,24 @@ def test_seeds_differ_and_repeat(seed):
     same = layout_of(seed), layout_of(seed)
     jax.tree.map(assert_array_equal, *same)
     assert (layout_of(seed).position != layout_of(seed + 1).position).any()
+
+
+def test_another_way_to_see():
+    """The environment with the full observation plays the same slots, and tells the true last observation likewise."""
+    scenario = make_scenario()
+    plain, full = UavMecEnv(), UavMecEnv(see=observe_devices)
+    assert full.observation_shape(scenario).features == (12, len(FEATURES))
+    seen, state = full.reset(jax.random.key(0), scenario)
+    _, same = plain.reset(jax.random.key(0), scenario)
+    for number in range(12):  # visiting one device over and over: the data of the others expire
+        key = jax.random.key(number)
+        seen, state, reward, ended, _, info = full.step(key, state, 3, scenario)
+        _, same, other_reward, other_end, _, _ = plain.step(key, same, 3, scenario)
+        assert (float(reward), bool(ended)) == (float(other_reward), bool(other_end))
+        if ended:
+            break
+    assert bool(ended)
+    age = [feature.name for feature in FEATURES].index("age")
+    assert float(jnp.max(info["final_observation"].features[:, age])) == 1.0
+    assert float(jnp.max(seen.features[:, age])) == 0.0
+    assert_array_equal(state.age, same.age)

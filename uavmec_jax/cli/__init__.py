@@ -4,6 +4,7 @@ from typing import Any
 
 import click
 
+from uavmec_jax.cli.advise import advise
 from uavmec_jax.cli.common import fail
 from uavmec_jax.cli.machine import doctor
 from uavmec_jax.cli.runs import resume, status, submit, worker
@@ -38,6 +39,7 @@ def main() -> None:
     uavmec resume runs/...        go on with one that was stopped or killed
     uavmec status runs/...        how far it is
     uavmec search dqn             better settings: trials by the batch, each batch one program
+    uavmec advise my-town.toml    whom to visit next, what will fail first; no training needed
     uavmec plan my-town.toml      tours for your own devices, what fails first, what to repair
     uavmec show runs/...          the tables of a run again
     uavmec traffic show albany    an evacuation, and which devices see it
@@ -46,7 +48,10 @@ def main() -> None:
     """
 
 
-_COMMANDS = (run, resume, status, worker, submit, search, plan, evaluate, show, compare, validate, traffic, doctor)
+_COMMANDS = (
+    *(run, resume, status, worker, submit, search),
+    *(advise, plan, evaluate, show, compare, validate, traffic, doctor),
+)
 
 for _command in _COMMANDS:
     main.add_command(_command)

@@ -33,7 +33,7 @@ def plan(
     as_json: bool,
 ) -> None:
     """Plan for SCENARIO, a layout file (TOML or CSV), or for a random town: tours, bound, first failure, repairs."""
-    town = _town(scenario, powered, connected, place)
+    town = town_of(scenario, powered, connected, place)
     if not 1 <= width <= 100_000:
         fail(f"--width is {width}; give 1 to 100000 states")
     from uavmec_jax.studies import host
@@ -100,7 +100,7 @@ def evaluate(
 
     Of a run it is by default the agent that learned in the town asked for.
     """
-    town = _town(scenario, powered, connected, place)
+    town = town_of(scenario, powered, connected, place)
     from rich.console import Console
 
     from uavmec_jax.reporting.compare import evaluation_table
@@ -148,7 +148,7 @@ def evaluate(
             )
 
 
-def _town(scenario: Path | None, powered: int | None, connected: int | None, place: str | None) -> dict[str, Any]:
+def town_of(scenario: Path | None, powered: int | None, connected: int | None, place: str | None) -> dict[str, Any]:
     """How many devices of a random town have what; refuses counts and places beside a layout file."""
     if scenario is not None and (powered, connected, place) != (None, None, None):
         fail(

@@ -11,7 +11,9 @@ from jaxtyping import Array, Float
 
 from uavmec_jax.learning import on_policy
 from uavmec_jax.learning.algorithm import Agent, Algorithm
-from uavmec_jax.learning.on_policy import OnPolicyHyper, OnPolicySpec, OnPolicyState, Samples
+from uavmec_jax.learning.estimates import log_probability, normalized
+from uavmec_jax.learning.experience import Samples, play
+from uavmec_jax.learning.on_policy import OnPolicyHyper, OnPolicySpec, OnPolicyState
 from uavmec_jax.learning.optimizers import Descent, clipped_rmsprop, descend
 
 _OPTIMIZER = clipped_rmsprop(decay=0.99, eps=1e-5)
@@ -42,11 +44,10 @@ def algorithm(spec: A2CSpec) -> Algorithm:
 
 def a2c_loss(spec: A2CSpec, hyper: A2CHyper, weights: Any, samples: Samples) -> Float[Array, ""]:
     """Policy gradient, squared value error and entropy of a rollout ``[B]`` (Mnih et al., 2016, section 4)."""
-    advantage = on_policy.normalized(samples.advantage, hyper.normalize_advantage)
-    log_prob, entropy = on_policy.log_probability(
-        on_policy.logits(spec, hyper, weights, samples.observation), samples.action
-    )
-    error = jnp.mean(jnp.square(samples.returns - on_policy.value(spec, hyper, weights, samples.observation)))
+    advantage = normalized(samples.advantage, hyper.normalize_advantage)
+    scores, values = on_policy.both(spec, hyper, weights, samples.observation)
+    log_prob, entropy = log_probability(scores, samples.action)
+    error = jnp.mean(jnp.square(samples.returns - values))
     return hyper.vf_coef * error - jnp.mean(advantage * log_prob) - hyper.ent_coef * jnp.mean(entropy)
 
 
@@ -70,5 +71,5 @@ def learn(
 
 def _iteration(spec: A2CSpec, agent: Agent, state: OnPolicyState, i: Any) -> OnPolicyState:
     """A rollout and one gradient step."""
-    state, samples = on_policy.play(spec, agent, state, jax.random.fold_in(agent.key, i))
+    state, samples = play(spec, agent, state, jax.random.fold_in(agent.key, i))
     return state.after(*learn(spec, agent.hyper, state.descent, samples, (i + 1) * spec.steps_per_iteration))

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 from flax import struct
 from jaxtyping import Array
 
-from uavmec_jax.world.environment import Scenario, observe
+from uavmec_jax.learning.perception import PERCEPTIONS
 from uavmec_jax.world.layout import Layout
 from uavmec_jax.world.params import Params
 from uavmec_jax.world.physics import State
@@ -23,12 +23,12 @@ class Agent:
 
     Attributes:
         key: the agent's own randomness, from its identity, never from its place in a batch.
-        scenario: what it plays.
+        scenario: what it plays: one scenario, or (PPO and A2C) a distribution, from which every episode draws its own.
         hyper: how it learns; the algorithm's pytree of traced hyperparameters.
     """
 
     key: Any
-    scenario: Scenario
+    scenario: Any
     hyper: Any
 
 
@@ -53,7 +53,10 @@ class Algorithm:
         init: ``(agent) -> state``.
         update: ``(agent, state, first, last) -> state``: the iterations ``first <= i < last``; the two bounds are
             shared by all agents and never batched. Runs under ``vmap(axis_name=AGENTS_AXIS)``.
-        greedy: ``(hyper, weights, observation [..., 2n]) -> action [...]`` int32, the best one in the eyes of the weights.
+        greedy: ``(hyper, weights, observation [..., words]) -> action [...]`` int32, the best one in the eyes of the weights.
+        see: ``(params, layout, state) -> observation [..., words]``; by default the paper's.
+        critic: ``(hyper, weights, observation [B, words]) -> [B]``, what the rest of an episode is worth; ``None`` where
+            there is no critic.
     """
 
     name: str
@@ -63,12 +66,14 @@ class Algorithm:
     init: Callable[[Agent], Any]
     update: Callable[[Agent, Any, Any, Any], Any]
     greedy: Callable[[Any, Any, Array], Array]
+    see: Callable[[Params, Layout, State], Array] = PERCEPTIONS["paper"].see
+    critic: Callable[[Any, Any, Array], Array] | None = None
 
     def policy(self, hyper: Any, weights: Any) -> Policy:
         """The greedy policy of an agent; ties go to the lowest number. States may be batched."""
 
         def act(params: Params, layout: Layout, state: State, key: Any = None) -> Array:
-            return self.greedy(hyper, weights, observe(layout, state))
+            return self.greedy(hyper, weights, self.see(params, layout, state))
 
         return act
 

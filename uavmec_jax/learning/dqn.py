@@ -73,6 +73,11 @@ class DQNSpec:
         return -(-self.total_steps // self.train_frequency)
 
     @property
+    def words(self) -> int:
+        """Numbers in one observation."""
+        return 2 * self.n_devices
+
+    @property
     def network(self) -> QNetwork:
         """The Q-network."""
         return QNetwork(n_actions=self.n_devices, hidden=self.hidden, dueling=self.dueling)
@@ -93,7 +98,7 @@ class DQNSpec:
     @property
     def agent_bytes(self) -> int:
         """Memory of one agent in training, bytes: replay, weights, target, moments, gradient, best weights."""
-        return self.replay.bytes + 6 * 4 * n_weights(self.network, 2 * self.n_devices)
+        return self.replay.bytes + 6 * 4 * n_weights(self.network, self.words)
 
 
 @struct.dataclass

@@ -162,3 +162,96 @@ def scale_ages(observation: Float[Array, "*b two_n"], age_scale: Any) -> Float[A
     """An observation with its ages, the second half, multiplied by ``age_scale``."""
     size = observation.shape[-1]
     return observation * jnp.where(jnp.arange(size) < size // 2, 1.0, age_scale)
+
+
+@jax.custom_jvp
+def sum_in_any_order(x: Float[Array, "*b n f"]) -> Float[Array, "*b f"]:
+    """Sum over the devices that does not depend on their order, to the bit: in fixed point, steps of 2**-16.
+
+    Terms beyond +-400 are cut, so that 64 of them fit. The gradient is that of a plain sum.
+    """
+    fixed = jnp.round(jnp.clip(x, -400.0, 400.0) * 65536.0).astype(jnp.int32)
+    return jnp.sum(fixed, axis=-2).astype(jnp.float32) / 65536.0
+
+
+@sum_in_any_order.defjvp
+def _sum_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    return sum_in_any_order(*primals), jnp.sum(tangents[0], axis=-2)
+
+
+class Score(nn.Module):
+    """One number for each row, orthogonal weights times ``gain``, the bits of which do not depend on the row's place.
+
+    A matrix product with one column has other bits in the last rows of a batch than in the first (XLA's CPU kernels); a
+    product and a sum over each row by itself have not.
+    """
+
+    gain: float
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*b i"]) -> Float[Array, "*b"]:
+        """Apply the layer to ``[..., i]``."""
+        kernel = self.param("kernel", orthogonal, (x.shape[-1], 1), self.gain)
+        return jnp.sum(x * kernel[:, 0], axis=-1) + self.param("bias", nn.initializers.zeros, (1,))[0]
+
+
+class EquivariantActorCritic(nn.Module):
+    """An actor and a critic for any number of devices: permuting the devices permutes the logits, and nothing else.
+
+    One small network looks at every device by itself; means and maxima over the devices tell a second one, again for
+    every device by itself, about the others (Zaheer et al., 2017, Deep sets, theorem 2 and section 4).
+
+    Attributes:
+        n_features: features of a device; the rows of an observation hold its mask behind them.
+        hidden: width of the layer that looks at a device, and of the one that knows about the others.
+    """
+
+    n_features: int
+    hidden: tuple[int, ...] = (64, 64)
+
+    def setup(self) -> None:
+        """Declare the layers."""
+        gain = math.sqrt(2.0)
+        self.looks = [OrthogonalDense(width, gain) for width in self.hidden]
+        self.others = OrthogonalDense(self.hidden[-1], gain)
+        self.own = OrthogonalDense(self.hidden[-1], gain)
+        self.score = Score(0.01)
+        self.appraise = OrthogonalDense(self.hidden[-1], gain)
+        self.worth = Score(1.0)
+
+    def _pooled(self, observation: Float[Array, "b words"]) -> tuple[Array, Array, Array]:
+        """Every device by itself ``[B, n, h]``, all of them ``[B, 2h]``, and the mask ``[B, n]``."""
+        devices = observation.reshape(observation.shape[0], -1, self.n_features + 1)
+        mask = devices[..., -1] > 0.5
+        x = devices[..., :-1].reshape(-1, self.n_features)
+        for layer in self.looks:
+            x = nn.relu(layer(x))
+        x = x.reshape(*mask.shape, -1)
+        shown = jnp.where(mask[..., None], x, 0.0)  # what relu leaves is not negative, so 0 never wins over a device
+        count = jnp.maximum(jnp.sum(mask, axis=-1, keepdims=True), 1)
+        return x, jnp.concatenate([sum_in_any_order(shown) / count, jnp.max(shown, axis=-2)], axis=-1), mask
+
+    def _logits(self, x: Array, pooled: Array, mask: Array) -> Float[Array, "b n"]:
+        own = self.own(x.reshape(-1, x.shape[-1])).reshape(x.shape)
+        x = nn.relu(own + self.others(pooled)[:, None])
+        return jnp.where(mask, self.score(x), NOT_THERE)
+
+    def _value(self, pooled: Array) -> Float[Array, " b"]:
+        return self.worth(nn.relu(self.appraise(pooled)))
+
+    def logits(self, observation: Float[Array, "b words"]) -> Float[Array, "b n"]:
+        """Unnormalised log-probabilities ``[B, n]`` of the actions; :data:`NOT_THERE` where there is no device."""
+        return self._logits(*self._pooled(observation))
+
+    def value(self, observation: Float[Array, "b words"]) -> Float[Array, " b"]:
+        """State values ``[B]``."""
+        return self._value(self._pooled(observation)[1])
+
+    def __call__(self, observation: Float[Array, "b words"]) -> tuple[Array, Array]:
+        """Logits and values."""
+        x, pooled, mask = self._pooled(observation)
+        return self._logits(x, pooled, mask), self._value(pooled)
+
+
+NOT_THERE = -1e9
+"""Logit of an action that is no device."""

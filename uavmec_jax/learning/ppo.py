@@ -1,6 +1,6 @@
 """Proximal policy optimisation with the defaults of Stable-Baselines3, the library of the paper: one agent."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -11,7 +11,9 @@ from jaxtyping import Array, Float
 
 from uavmec_jax.learning import on_policy
 from uavmec_jax.learning.algorithm import Agent, Algorithm
-from uavmec_jax.learning.on_policy import OnPolicyHyper, OnPolicySpec, OnPolicyState, Samples
+from uavmec_jax.learning.estimates import log_probability, normalized
+from uavmec_jax.learning.experience import Samples, play
+from uavmec_jax.learning.on_policy import OnPolicyHyper, OnPolicySpec, OnPolicyState
 from uavmec_jax.learning.optimizers import Descent, clipped_adam, descend
 
 _OPTIMIZER = clipped_adam(eps=1e-5)
@@ -23,6 +25,8 @@ class PPOHyper(OnPolicyHyper):
 
     clip_range: Any = struct.field(default=0.2, metadata={"gt": 0})
     """How far the probability ratio may leave 1."""
+    learning_rate_decay: Any = struct.field(default=1.0, metadata={"gt": 0, "le": 1})
+    """Learning rate at the end of training over the one at its beginning; it falls geometrically."""
 
 
 @dataclass(frozen=True)
@@ -55,30 +59,32 @@ def algorithm(spec: PPOSpec) -> Algorithm:
 
 def ppo_loss(spec: PPOSpec, hyper: PPOHyper, weights: Any, batch: Samples) -> Float[Array, ""]:
     """Clipped surrogate, squared value error and entropy of a minibatch ``[B]`` (Schulman et al., 2017, equation 9)."""
-    advantage = on_policy.normalized(batch.advantage, hyper.normalize_advantage)
-    log_prob, entropy = on_policy.log_probability(
-        on_policy.logits(spec, hyper, weights, batch.observation), batch.action
-    )
+    advantage = normalized(batch.advantage, hyper.normalize_advantage)
+    scores, values = on_policy.both(spec, hyper, weights, batch.observation)
+    log_prob, entropy = log_probability(scores, batch.action)
     ratio = jnp.exp(log_prob - batch.log_prob)
     clipped = jnp.clip(ratio, 1.0 - hyper.clip_range, 1.0 + hyper.clip_range)
     surrogate = jnp.mean(jnp.minimum(advantage * ratio, advantage * clipped))
-    error = jnp.mean(jnp.square(batch.returns - on_policy.value(spec, hyper, weights, batch.observation)))
+    error = jnp.mean(jnp.square(batch.returns - values))
     return hyper.vf_coef * error - surrogate - hyper.ent_coef * jnp.mean(entropy)
 
 
 def _iteration(spec: PPOSpec, agent: Agent, state: OnPolicyState, i: Any) -> OnPolicyState:
     """A rollout, then ``n_epochs`` passes over it in fresh random orders."""
     play_key, *epoch_keys = jax.random.split(jax.random.fold_in(agent.key, i), 1 + spec.n_epochs)
-    state, samples = on_policy.play(spec, agent, state, play_key)
+    state, samples = play(spec, agent, state, play_key)
     updates_done = i * spec.n_epochs * spec.minibatches
     steps_done = (i + 1) * spec.steps_per_iteration
     rows = _rows(samples)
+    hyper = agent.hyper
+    decay = hyper.learning_rate_decay ** (i / spec.iterations)
+    hyper = replace(hyper, learning_rate=hyper.learning_rate * decay)
 
     def epoch(carry: tuple[Descent, Array], numbered: tuple[Any, Any]) -> tuple[tuple[Descent, Array], None]:
         number, key = numbered
         shuffled = rows[_permutation(key, rows.shape[0])]
         count = updates_done + number * spec.minibatches + 1
-        return learn(spec, agent.hyper, carry[0], shuffled, count, steps_done), None
+        return learn(spec, hyper, carry[0], shuffled, count, steps_done), None
 
     numbered = (jnp.arange(spec.n_epochs), jnp.stack(epoch_keys))
     (descent, loss), _ = jax.lax.scan(epoch, (state.descent, state.loss), numbered)

@@ -13,7 +13,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Key
 
 from uavmec_jax.learning.algorithm import AGENTS_AXIS, Agent, Algorithm
-from uavmec_jax.world.rollout import returns, rollouts
+from uavmec_jax.world.distribution import ScenarioDistribution, play_draws, scenario_of_draw
+from uavmec_jax.world.environment import Scenario
+from uavmec_jax.world.rollout import Policy, returns
 
 
 @struct.dataclass
@@ -97,16 +99,29 @@ def no_best_yet(state: Any) -> Best:
 def _look(algorithm: Algorithm, agent: Agent, keys: Key[Array, " D"], weights: Any, best: Best, step: Any) -> Any:
     """Validation score of the greedy policy of one agent, and the best so far (ties keep the earlier).
 
-    The score is the mean lifetime; of agents that are paid for more, for traffic, it is what they earn.
+    The draws are of task volumes; of agents that play many scenarios, of a scenario each besides.
     """
-    scenario = agent.scenario
-    policy = algorithm.policy(agent.hyper, weights)
-    score = jnp.mean(rollouts(policy, scenario.params, scenario.layout, keys).length.astype(jnp.float32))
-    if scenario.layout.traffic is not None:
-        paid = (scenario.reward.traffic_bonus > 0) | (scenario.reward.traffic_penalty > 0)
-        score = jnp.where(paid, jnp.mean(returns(policy, scenario, keys)), score)
+    score = _score(algorithm.policy(agent.hyper, weights), agent.scenario, keys)
     better = score > best.score
     kept = jax.tree.map(
         lambda new, old: jnp.where(better, new, old), (weights, score, step), (best.weights, best.score, best.step)
     )
     return score, Best(*kept)
+
+
+def _score(policy: Policy, plays: Scenario | ScenarioDistribution, keys: Key[Array, " D"]) -> Array:
+    """The mean lifetime; of agents that are paid for more, for traffic, what they earn.
+
+    Where every draw is another scenario, lives are counted less the price of the first failure.
+    """
+    played = play_draws(policy, plays, keys)
+    lives = played.length.astype(jnp.float32)
+    if isinstance(plays, ScenarioDistribution):
+        traffic: Any = jax.vmap(partial(scenario_of_draw, plays))(keys).layout.traffic
+        price = traffic.price * jnp.sum(played.first_failure * traffic.weight[:, 0], axis=-1)
+        return jnp.mean(lives - price)
+    score = jnp.mean(lives)
+    if plays.layout.traffic is not None:
+        paid = (plays.reward.traffic_bonus > 0) | (plays.reward.traffic_penalty > 0)
+        score = jnp.where(paid, jnp.mean(returns(policy, plays, keys)), score)
+    return score

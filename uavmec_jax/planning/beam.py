@@ -9,6 +9,7 @@ cannot be passed and takes one slot off the aim until it succeeds. All that it d
 a beam that is wide enough finds the optimum.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -56,6 +57,10 @@ class _Beam(NamedTuple):
     best: Any
 
 
+Appraisal = Callable[[Params, Layout, State], Array]
+"""``(params, layout, states [W]) -> [W]`` f32: how promising states are, all after equally many slots."""
+
+
 class _Problem(NamedTuple):
     """One layout with one volume draw, and what is worked out about it once."""
 
@@ -67,6 +72,7 @@ class _Problem(NamedTuple):
     hover: Any
     calls_from: Any
     round_m: Any
+    appraise: Appraisal | None
 
 
 def horizon(params: Params, layouts: Layout) -> int:
@@ -92,7 +98,12 @@ def _longest(params: Params, layout: Layout) -> Int[Array, ""]:
 
 
 def beam_search(
-    params: Params, layout: Layout, volumes: Num[Array, "H n"], width: int = WIDTH, at_most: Any = None
+    params: Params,
+    layout: Layout,
+    volumes: Num[Array, "H n"],
+    width: int = WIDTH,
+    at_most: Any = None,
+    appraise: Appraisal | None = None,
 ) -> Tour:
     """The longest life that the beam finds; clairvoyant in ``volumes``.
 
@@ -102,13 +113,16 @@ def beam_search(
         volumes: bytes, the tasks of every slot; ``H`` from :func:`horizon`.
         width: states kept per slot, static.
         at_most: a lifetime that is known not to be passed; the search begins there.
+        appraise: which of the states that are not provably lost are kept, e.g. the value that a critic has learned; by
+            default those from which the way to the aim takes the least of what is left.
     """
     costs = demand.slot_costs(params, layout, volumes)
     covers = demand.coverage(params, layout)
     charged = demand.shares(layout, covers)
     hover = demand.fetched_from(covers, ~layout.has_power | ~layout.has_comms)
     calls_from = demand.fetched_from(covers, ~layout.has_comms)
-    problem = _Problem(params, layout, volumes, costs, charged, hover, calls_from, _typical_round(layout, charged))
+    round_m = _typical_round(layout, charged)
+    problem = _Problem(params, layout, volumes, costs, charged, hover, calls_from, round_m, appraise)
     aim = counting_bound(params, layout, costs)
     aim = aim if at_most is None else jnp.minimum(aim, at_most)
 
@@ -240,6 +254,8 @@ def _promise(problem: _Problem, slot: Array, aim: Array, states: State) -> Float
         | demand.overdue(params, layout, charged, states.age, left)
         | (spare < 0.0)
     )
+    if problem.appraise is not None:
+        return jnp.where(lost & (left >= 0), -jnp.inf, problem.appraise(params, layout, states))
     # Devices that are served from one hover point share their visits.
     visits = jnp.sum(jnp.maximum(demand.most_by_place(problem.hover, need + smooth), 0.0), axis=-1)
     pressure = 0.5 * visits / jnp.maximum(left, 1) + flights / jnp.maximum(spare, 1.0)

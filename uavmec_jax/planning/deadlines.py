@@ -35,7 +35,7 @@ def earliest_deadline(params: Params, layout: Layout, state: State, key: PRNGKey
     """
     covers = demand.coverage(params, layout)
     mean = demand.mean_slot(params, layout)
-    slots, services = _hoped_for(params, layout, state, mean, demand.shares(layout, covers))
+    slots, services = hoped_for(params, layout, state, mean, demand.shares(layout, covers))
 
     away = jnp.linalg.norm(layout.position - state.uav_position, axis=-1)
     due = _due(params, layout, state, covers, slots)
@@ -62,10 +62,18 @@ def _due(params: Params, layout: Layout, state: State, covers: Bool[Array, "n n"
     return jnp.min(jnp.where(hover == jnp.arange(hover.shape[0])[:, None], left, demand.NEVER), axis=1)
 
 
-def _hoped_for(
+def hoped_for(
     params: Params, layout: Layout, state: State, mean: SlotCosts, charged: Float[Array, " n"]
 ) -> tuple[Any, Float[Array, " n"]]:
-    """Slots that may still be survived, and the services that each battery then needs."""
+    """Slots that may still be survived, and the services that each battery then needs.
+
+    Args:
+        params: scenario parameters.
+        layout: the devices.
+        state: before the slot.
+        mean: the slot to expect, from :func:`demand.mean_slot`.
+        charged: share of a visit that each device is charged with, from :func:`demand.shares`.
+    """
     shortest = jnp.min(mean.duration)
     drain = demand.idle_drain(layout, mean)
     per_saving = jnp.where(layout.has_power, 0.0, 1.0 / jnp.maximum(mean.work - mean.upload, 1e-3))

@@ -171,7 +171,7 @@ def overdue(
     return jnp.any(matters & (load > due + _ROUNDING * 10), axis=-1)
 
 
-def load_by_due(due: Int[Array, "*B n"], charged: Float[Array, " n"]) -> Float[Array, "*B n"]:
+def load_by_due(due: Num[Array, "*B n"], charged: Float[Array, " n"]) -> Float[Array, "*B n"]:
     """Charged visits that fall due no later than each entry's own due date."""
     # Entries in rows and one against all at a time: the batch stays the innermost axis, which is what a CPU is fast at.
     rows = jnp.moveaxis(due, -1, 0)

@@ -3,8 +3,9 @@
 Each has the common shape ``policy(params, layout, state, key=None) -> action`` (int32 in ``[0, n)``).
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -32,12 +33,20 @@ def random(params: Params, layout: Layout, state: State, key: PRNGKeyArray | Non
     """
     if key is None:
         raise ValueError("the random policy needs a key")
-    return jax.random.randint(key, (), 0, layout.capacity.shape[0], jnp.int32)
+    return _numbered(layout, lambda count: jax.random.randint(key, (), 0, count, jnp.int32))
 
 
 def round_robin(params: Params, layout: Layout, state: State, key: PRNGKeyArray | None = None) -> Array:
     """Visit the devices in the order of their numbers, over and over."""
-    return state.slot % layout.capacity.shape[0]
+    return _numbered(layout, lambda count: state.slot % count)
+
+
+def _numbered(layout: Layout, number: Callable[[Any], Array]) -> Array:
+    """The device with a number that depends on how many there are; entries that are no devices do not count."""
+    if layout.present is None:
+        return number(layout.capacity.shape[0])
+    chosen = number(jnp.sum(layout.present))
+    return jnp.argmax(jnp.cumsum(layout.present) > chosen).astype(jnp.int32)
 
 
 def oldest_first(params: Params, layout: Layout, state: State, key: PRNGKeyArray | None = None) -> Array:

@@ -1,7 +1,7 @@
 """The outlook of one scenario: who lives how long, by which tour, what fails first, and what a repair would bring."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Int, Key
 
 from uavmec_jax.planning.beam import horizon
+from uavmec_jax.planning.changes import WhatIf, every_change, rank_changes
 from uavmec_jax.planning.heuristics import HEURISTICS
 from uavmec_jax.planning.lookahead import SAMPLES
 from uavmec_jax.planning.parallel import bound_all, play_beam, play_heuristics, play_rollout
@@ -19,24 +20,6 @@ from uavmec_jax.world.physics import Cause
 from uavmec_jax.world.rollout import Trace, tour_policy, trace
 
 WIDTH = 256
-CHANGES = ("repair power", "repair comms", "remove")
-
-
-@dataclass(frozen=True)
-class WhatIf:
-    """What changing one device would bring.
-
-    Attributes:
-        device: index from 0.
-        change: one of :data:`CHANGES`.
-        lifetime: slots, mean over the draws, under the rollout planner.
-        gain: slots more than without the change, on the same draws.
-    """
-
-    device: int
-    change: str
-    lifetime: float
-    gain: float
 
 
 @dataclass(frozen=True)
@@ -81,9 +64,9 @@ def look_ahead(
         width: of the beam.
         samples: futures that the rollout planner imagines per candidate.
     """
-    count, n = draws.shape[0], layout.capacity.shape[0]
+    count = draws.shape[0]
     # The rollout planner plays the scenario as it is and with every change in one call.
-    changed = [_changed(layout, device, change) for change in CHANGES for device in range(n)]
+    changed = every_change(layout)
     scenarios = jax.tree.map(lambda *leaves: jnp.repeat(jnp.stack(leaves), count, axis=0), layout, *changed)
     every, many = _repeat(params, len(scenarios.capacity)), _repeat(params, count)
     layouts = jax.tree.map(lambda leaf: leaf[:count], scenarios)
@@ -106,7 +89,7 @@ def look_ahead(
             name: _route(_trace(params, layout, draws[0], tour))
             for name, tour in (("rollout", tours[0]), ("beam", best_tours[0]))
         },
-        what_if=_what_if(layout, lives[1:].reshape(len(CHANGES), n, count), lives[0]),
+        what_if=rank_changes(layout, lives[1:], lives[0]),
     )
 
 
@@ -123,35 +106,3 @@ def _route(played: Trace) -> Trace:
     """The slots that were played, the one the UAV could not pay for left out; NumPy leaves."""
     started = np.asarray(played.played) & ~(np.asarray(played.outcome.cause) == Cause.UAV)
     return jax.tree.map(lambda leaf: np.asarray(leaf)[started], played)
-
-
-def _what_if(layout: Layout, lives: np.ndarray, now: np.ndarray) -> tuple[WhatIf, ...]:
-    """The changes that make sense, ranked; ``lives [3, n, D]`` with them, ``now [D]`` without."""
-    lacks = {"repair power": ~np.asarray(layout.has_power), "repair comms": ~np.asarray(layout.has_comms)}
-    found = [
-        WhatIf(device, change, float(lives[row, device].mean()), float((lives[row, device] - now).mean()))
-        for row, change in enumerate(CHANGES)
-        for device in range(lives.shape[1])
-        if change == "remove" or lacks[change][device]
-    ]
-    return tuple(sorted(found, key=lambda one: (-one.gain, CHANGES.index(one.change), one.device)))
-
-
-def _changed(layout: Layout, device: int, change: str) -> Layout:
-    """The layout after one change.
-
-    A device that is removed lacks nothing any more, has no work, and its hover point moves to that of another device.
-    """
-    if change == "repair power":
-        return replace(layout, has_power=layout.has_power.at[device].set(True))
-    if change == "repair comms":
-        return replace(layout, has_comms=layout.has_comms.at[device].set(True))
-    neighbour = 1 if device == 0 else 0
-    other = neighbour if layout.capacity.shape[0] > 1 else device
-    return replace(
-        layout,
-        position=layout.position.at[device].set(layout.position[other]),
-        has_power=layout.has_power.at[device].set(True),
-        has_comms=layout.has_comms.at[device].set(True),
-        processing_rate=layout.processing_rate.at[device].set(jnp.inf),
-    )

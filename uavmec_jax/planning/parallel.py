@@ -10,21 +10,31 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Key
 
-from uavmec_jax.planning.beam import beam_search
+from uavmec_jax.planning.beam import Appraisal, beam_search
 from uavmec_jax.planning.bound import upper_bounds
+from uavmec_jax.planning.deadlines import earliest_deadline
 from uavmec_jax.planning.heuristics import HEURISTICS
 from uavmec_jax.planning.lookahead import rollout_planner
 from uavmec_jax.world.layout import Layout
 from uavmec_jax.world.params import Params
-from uavmec_jax.world.rollout import Episode, recorded, rollout, rollouts, tour_policy, volume_table
+from uavmec_jax.world.rollout import Episode, Policy, recorded, rollout, rollouts, tour_policy, volume_table
+
+_CPU_BATCH = 64
+"""Scenarios that a CPU core plays a policy on at once: enough for its matrix products, few enough for its cache."""
 
 _ACCELERATOR_BATCH = 256
 """Scenarios planned for at once on an accelerator. A CPU core takes one at a time and keeps it in its cache."""
 
 
-@partial(jax.jit, static_argnames=("slots", "width"))
+@partial(jax.jit, static_argnames=("slots", "width", "appraise"))
 def play_beam(
-    params: Params, layouts: Layout, keys: Key[Array, " B"], *, slots: int, width: int
+    params: Params,
+    layouts: Layout,
+    keys: Key[Array, " B"],
+    *,
+    slots: int,
+    width: int,
+    appraise: Appraisal | None = None,
 ) -> tuple[Any, Episode]:
     """The beam's tour for each of ``B`` scenarios, and the episode that it makes; clairvoyant.
 
@@ -34,22 +44,36 @@ def play_beam(
         keys: volume draws.
         slots: from :func:`uavmec_jax.planning.beam.horizon`.
         width: states kept per slot.
+        appraise: see :func:`beam_search`.
     """
 
     def one(params: Params, layout: Layout, key: Key[Array, ""]) -> tuple[Array, Episode]:
         volumes = volume_table(params, layout.capacity.shape[0], key, slots)
-        plan = beam_search(params, layout, volumes, width)
+        plan = beam_search(params, layout, volumes, width, appraise=appraise)
         return plan.actions, rollout(tour_policy(plan.actions), params, layout, key)
 
     return spread(one, params, layouts, keys)
 
 
-@partial(jax.jit, static_argnames=("slots", "samples"))
+@partial(jax.jit, static_argnames=("slots", "samples", "base"))
 def play_rollout(
-    params: Params, layouts: Layout, keys: Key[Array, " B"], *, slots: int, samples: int
+    params: Params,
+    layouts: Layout,
+    keys: Key[Array, " B"],
+    *,
+    slots: int,
+    samples: int,
+    base: Policy = earliest_deadline,
 ) -> tuple[Any, Episode]:
     """The rollout planner's tour for each scenario, and its episode; see :func:`rollout_planner` and :func:`play_beam`."""
-    return spread(partial(recorded, rollout_planner(samples=samples), slots=slots), params, layouts, keys)
+    return spread(partial(recorded, rollout_planner(base, samples), slots=slots), params, layouts, keys)
+
+
+@partial(jax.jit, static_argnames="policy")
+def play_policy(policy: Policy, params: Params, layouts: Layout, keys: Key[Array, "B D"]) -> Episode:
+    """Episodes ``[B, D]`` of any policy, ``B`` scenarios with ``D`` volume draws each, a batch of them at a time."""
+    one = lambda params, layout, keys: rollouts(policy, params, layout, keys)  # noqa: E731
+    return spread(one, params, layouts, keys, batch=_CPU_BATCH)
 
 
 @partial(jax.jit, static_argnames="names")
@@ -78,15 +102,18 @@ def _tables(params: Params, layouts: Layout, keys: Key[Array, " B"], slots: int)
     return jax.vmap(lambda params, key: volume_table(params, n, key, slots))(params, keys)
 
 
-def spread(function: Callable, *arguments: Any) -> Any:
-    """``vmap(function)(*arguments)`` over the leading axis, split over the local devices; call under ``jit``."""
+def spread(function: Callable, *arguments: Any, batch: int | None = None) -> Any:
+    """``vmap(function)(*arguments)`` over the leading axis, split over the local devices; call under ``jit``.
+
+    A CPU takes ``batch`` entries at a time, one by default.
+    """
     devices = jax.local_devices()
     count = jax.tree.leaves(arguments)[0].shape[0]
     missing = -count % len(devices)
     if missing:
         arguments = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf[:1].repeat(missing, 0)]), arguments)
     mesh, split = Mesh(devices, ("scenarios",)), PartitionSpec("scenarios")
-    batch = None if devices[0].platform == "cpu" else _ACCELERATOR_BATCH
+    batch = batch if devices[0].platform == "cpu" else _ACCELERATOR_BATCH
     in_turn = lambda *shard: jax.lax.map(lambda one: function(*one), shard, batch_size=batch)  # noqa: E731
     # check_vma: the loops end when each device's own scenarios end, which the checker has no type for.
     mapped = jax.shard_map(in_turn, mesh=mesh, in_specs=(split,) * len(arguments), out_specs=split, check_vma=False)

@@ -16,7 +16,8 @@ def shortest_tour(params: Params, layout: Layout, state: State, key: PRNGKeyArra
     device has both, all are on the tour.
     """
     needy = ~layout.has_power | ~layout.has_comms
-    needy = jnp.where(jnp.any(needy), needy, True)
+    everyone = True if layout.present is None else layout.present
+    needy = jnp.where(jnp.any(needy), needy, everyone)
     tour = two_opt(layout.position, nearest_neighbour(layout.position, needy), jnp.sum(needy))
     return tour[state.slot % jnp.sum(needy)]
 

@@ -9,6 +9,7 @@ import numpy as np
 from rich.table import Table
 
 from uavmec_jax.files import write_text
+from uavmec_jax.planning.changes import WhatIf
 from uavmec_jax.planning.outlook import Outlook
 from uavmec_jax.reporting import canvas
 from uavmec_jax.reporting.geojson import plan_geojson
@@ -37,7 +38,7 @@ def outlook_tables(outlook: Outlook, names: Sequence[str]) -> dict[str, Table]:
     }
     tours = {titles[name]: _tour_table(outlook, names, route) for name, route in outlook.routes.items()}
     lives = {f"Lifetime in slots, mean over {draws} volume draws": _lifetime_table(outlook)}
-    return lives | tours | {"What a repair or a removal would bring, slots": _what_if_table(outlook, names)}
+    return lives | tours | {"What a repair or a removal would bring, slots": change_table(outlook.what_if, names)}
 
 
 def _lifetime_table(outlook: Outlook) -> Table:
@@ -58,7 +59,7 @@ def _tour_table(outlook: Outlook, names: Sequence[str], route: Trace) -> Table:
         low, old = row["lowest_battery"], row["oldest_data"]
         table.add_row(
             str(row["slot"]),
-            _called(row["device"], row["name"]),
+            called(row["device"], row["name"]),
             f"{row['flight_m']:.0f}",
             " ".join(f"#{device}" for device in row["served"]),
             f"{row['duration_s']:.0f}",
@@ -96,18 +97,19 @@ def slot_rows(outlook: Outlook, names: Sequence[str], route: Trace) -> list[dict
     ]
 
 
-def _called(number: int, name: str) -> str:
+def called(number: int, name: str) -> str:
     """Number and name, unless the name says no more than the number."""
     return f"#{number}" if name == f"device {number}" else f"#{number} {name}"
 
 
-def _what_if_table(outlook: Outlook, names: Sequence[str]) -> Table:
+def change_table(changes: Sequence[WhatIf], names: Sequence[str]) -> Table:
+    """Repairs and removals, the most useful first."""
     table = Table()
     for name in ("rank", "device", "change", "lifetime", "gain"):
         table.add_column(name, justify="left" if name in ("device", "change") else "right")
-    for rank, one in enumerate(outlook.what_if, 1):
+    for rank, one in enumerate(changes, 1):
         table.add_row(
-            str(rank), _called(one.device + 1, names[one.device]), one.change, f"{one.lifetime:.2f}", f"{one.gain:+.2f}"
+            str(rank), called(one.device + 1, names[one.device]), one.change, f"{one.lifetime:.2f}", f"{one.gain:+.2f}"
         )
     return table
 
@@ -121,7 +123,7 @@ def outlook_summary(outlook: Outlook, names: Sequence[str]) -> list[str]:
     if first["device"] is None:
         lines = [f"No device fails first: {CAUSES[Cause[first['cause'].upper()]]}."]
     else:
-        who = _called(first["device"], first["name"])
+        who = called(first["device"], first["name"])
         lines = [
             f"First to fail: {who}, in {first['share']:.0%} of the draws; {CAUSES[Cause[first['cause'].upper()]]}."
         ]

@@ -4,8 +4,9 @@ A run leaves one collection of all its agents, ``weights.npz``; a policy saved o
 """
 
 import dataclasses
+import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from uavmec_jax.errors import PolicyError
 from uavmec_jax.files import read_checked, write_checked
 from uavmec_jax.learning.algorithm import Algorithm
 from uavmec_jax.learning.registry import ALGORITHMS
+from uavmec_jax.planning.observation import FEATURES
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.world.settings import tuples
 
@@ -37,12 +39,15 @@ class Collection:
         n_devices: number of devices.
         agents: algorithm -> one dictionary per agent: its value on every axis of the study.
         weights: ``<algorithm>/<best or last>/...``, leaves ``[A, ...]`` in the order of the agents.
+        drawn: what the agents' scenarios were drawn from, the study's ``scenarios`` and ``params``; empty where each agent
+            had one of its own.
     """
 
     settings: Mapping[str, Mapping[str, Any]]
     n_devices: int
     agents: Mapping[str, list[dict[str, Any]]]
     weights: Mapping[str, np.ndarray]
+    drawn: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     def of_study(
@@ -55,6 +60,7 @@ class Collection:
             n_devices=study.params.n_devices,
             agents={name: [dict(who) | place for who in own] for name, own in agents.items()},
             weights=traverse_util.flatten_dict(dict(weights), sep="/"),
+            drawn=_drawn(study),
         )
 
     def weights_of(self, which: str, algorithm: str | None = None) -> dict[str, Any]:
@@ -75,12 +81,24 @@ class Collection:
 
     def algorithm(self, name: str) -> Algorithm:
         """The algorithm of some of the agents, as far as policies need it."""
-        return ALGORITHMS[name].make(tuples(self.settings[name]), total_steps=1, n_devices=self.n_devices, max_age=1)
+        return ALGORITHMS[name].make(self._settings(name), total_steps=1, n_devices=self.n_devices, max_age=1)
+
+    def spec(self, name: str) -> Any:
+        """The static settings of some of the agents."""
+        return ALGORITHMS[name].spec_of(self._settings(name), n_devices=self.n_devices)
+
+    def _settings(self, name: str) -> dict[str, Any]:
+        """Settings of an algorithm, with the defaults of what an older version did not know."""
+        declared = ALGORITHMS[name]
+        spec = declared.spec()
+        return {one: getattr(spec, one) for one in declared.static} | tuples(self.settings[name])
 
     def hyper(self, name: str, agent: Mapping[str, Any]) -> Any:
         """The hyperparameters of one agent."""
         values = dict(self.settings[name]) | dict(agent)
-        return ALGORITHMS[name].hyper(**{field: values[field] for field in ALGORITHMS[name].traced})
+        declared = ALGORITHMS[name]
+        known = vars(declared.hyper())  # what an older version did not know had no effect then, as its default has now
+        return declared.hyper(**{one: values.get(one, known[one]) for one in declared.traced})
 
     def pick(self, axes: Mapping[str, Any]) -> tuple[str, int]:
         """The algorithm and the place of the one agent that has the given values on its axes.
@@ -104,9 +122,25 @@ class Collection:
         raise PolicyError(f"{len(found)} agents have {asked}; say which: they differ in {', '.join(differ)}")
 
 
+def sees_all(settings: Mapping[str, Any]) -> bool:
+    """Whether an algorithm's policies see the full observation, and so play layouts of any number of devices."""
+    return settings.get("observation") == "full"
+
+
+def _drawn(study: Study) -> dict[str, Any]:
+    """What scenarios were drawn from, as plain data; infinite numbers, which JSON has no word for, are left out."""
+    if study.scenarios is None:
+        return {}
+    params = {name: value for name, value in study.params.model_dump().items() if value != math.inf}
+    return {"scenarios": study.scenarios.model_dump(mode="json"), "params": params}
+
+
 def write_collection(path: Path, collection: Collection) -> None:
     """Write a collection, whole or not at all."""
-    facts = {field: getattr(collection, field) for field in ("settings", "n_devices", "agents")}
+    facts = {name: getattr(collection, name) for name in ("settings", "n_devices", "agents")}
+    facts |= {"drawn": collection.drawn} if collection.drawn else {}
+    if any(sees_all(settings) for settings in collection.settings.values()):
+        facts["features"] = [feature.name for feature in FEATURES]
     write_checked(path, SCHEMA, facts, collection.weights)
 
 
@@ -119,7 +153,11 @@ def read_collection(path: Path) -> Collection:
     facts, weights = read_checked(path, SCHEMA, "a file of policies", PolicyError)
     if missing := {"settings", "n_devices", "agents"} - set(facts):
         raise PolicyError(f"{path}: is not a file of policies: its header has no {', '.join(sorted(missing))}")
-    found = Collection(facts["settings"], facts["n_devices"], facts["agents"], weights)
+    if facts.get("features", []) not in ([], [feature.name for feature in FEATURES]):
+        raise PolicyError(
+            f"{path}: its policies see other features of a device than those of this version; train again"
+        )
+    found = Collection(facts["settings"], facts["n_devices"], facts["agents"], weights, facts.get("drawn", {}))
     _check_shapes(path, found)
     return found
 
@@ -143,9 +181,8 @@ def _check_shapes(path: Path, collection: Collection) -> None:
 
 
 def _shapes(collection: Collection, name: str) -> Iterable[tuple[str, tuple[int, ...]]]:
-    spec = ALGORITHMS[name].spec_of(tuples(collection.settings[name]), n_devices=collection.n_devices)
-    network = spec.network
-    made: Any = jax.eval_shape(network.init, jax.random.key(0), jnp.zeros((1, 2 * collection.n_devices)))
+    spec = collection.spec(name)
+    made: Any = jax.eval_shape(spec.network.init, jax.random.key(0), jnp.zeros((1, spec.words)))
     return [(key, leaf.shape) for key, leaf in traverse_util.flatten_dict(made, sep="/").items()]
 
 

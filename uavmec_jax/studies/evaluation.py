@@ -7,7 +7,6 @@ from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 from jaxtyping import Array, Key
@@ -15,9 +14,11 @@ from jaxtyping import Array, Key
 from uavmec_jax.learning.algorithm import Agent, Algorithm
 from uavmec_jax.planning.beam import horizon
 from uavmec_jax.planning.parallel import bound_all, play_beam, play_heuristics, play_rollout
+from uavmec_jax.studies.drawn import one_by_one
 from uavmec_jax.studies.schema import Evaluation
+from uavmec_jax.world.distribution import ScenarioDistribution, play_draws
 from uavmec_jax.world.physics import Cause
-from uavmec_jax.world.rollout import Episode, rollouts
+from uavmec_jax.world.rollout import Episode
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,12 @@ def judge_heuristics(agents: Agent, keys: Key[Array, "A D"], names: Iterable[str
     names = tuple(names)
     if not names:
         return {}
-    played = play_heuristics(names, agents.scenario.params, agents.scenario.layout, keys)
+    if isinstance(agents.scenario, ScenarioDistribution):
+        params, layouts, flat = one_by_one(agents.scenario, keys)
+        played = play_heuristics(names, params, layouts, flat[:, None])
+        played = jax.tree.map(lambda leaf: leaf.reshape(len(names), *keys.shape, *leaf.shape[3:]), played)
+    else:
+        played = play_heuristics(names, agents.scenario.params, agents.scenario.layout, keys)
     return {name: judgement(jax.tree.map(lambda leaf, k=k: leaf[k], played)) for k, name in enumerate(names)}
 
 
@@ -130,10 +136,7 @@ def judge_planners(
     """
     draws = min(settings.planner_draws, keys.shape[1])
     shape = (keys.shape[0], draws)
-    params, layouts = jax.tree.map(
-        lambda leaf: jnp.repeat(leaf, draws, axis=0), (agents.scenario.params, agents.scenario.layout)
-    )
-    keys = keys[:, :draws].reshape(-1)
+    params, layouts, keys = one_by_one(agents.scenario, keys[:, :draws])
     slots = horizon(params, layouts)
     judged = {}
     if "rollout" in settings.planners:
@@ -253,7 +256,6 @@ def judge_all(
 @partial(jax.jit, static_argnames="algorithm")
 def _play_learned(algorithm: Algorithm, agents: Agent, keys: Key[Array, "A D"], weights: Any) -> Episode:
     def one(agent: Agent, draws: Key[Array, " D"], weights: Any) -> Episode:
-        policy = algorithm.policy(agent.hyper, weights)
-        return rollouts(policy, agent.scenario.params, agent.scenario.layout, draws)
+        return play_draws(algorithm.policy(agent.hyper, weights), agent.scenario, draws)
 
     return jax.vmap(one)(agents, keys, weights)

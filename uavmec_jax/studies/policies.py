@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +15,17 @@ from jaxtyping import Array
 from uavmec_jax.errors import PolicyError
 from uavmec_jax.planning.heuristics import HEURISTICS
 from uavmec_jax.planning.lookahead import rollout_planner
-from uavmec_jax.studies.collection import WEIGHTS, Collection, of_one, read_collection, write_collection
-from uavmec_jax.world.environment import observe
+from uavmec_jax.planning.observation import FEATURES
+from uavmec_jax.studies.collection import WEIGHTS, Collection, of_one, read_collection, sees_all, write_collection
+from uavmec_jax.studies.drawn import unlike
 from uavmec_jax.world.layout import Layout
 from uavmec_jax.world.params import Params
 from uavmec_jax.world.physics import State
 from uavmec_jax.world.rollout import Policy
 from uavmec_jax.world.settings import nearest
+
+_SHIPPED = resources.files("uavmec_jax.studies") / "library"
+"""Where the policies lie that ship with the package, beside the studies that trained them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,15 +35,17 @@ class TrainedPolicy:
     Attributes:
         algorithm: name of what trained it.
         trained_on: its value on every axis of the study: seed, powered and connected devices, ...
-        n_devices: number of devices; fixed by the network.
+        n_devices: number of devices, fixed by the network; ``None`` where it plays any number.
         collection: the file's contents, of this agent alone.
     """
 
     algorithm: str
     trained_on: Mapping[str, Any]
-    n_devices: int
+    n_devices: int | None
     collection: Collection = field(repr=False)
+    _act: Any = field(repr=False)
     _greedy: Any = field(repr=False)
+    _appraise: Any = field(repr=False)
 
     @classmethod
     def of(cls, collection: Collection, name: str, place: int, which: str) -> "TrainedPolicy":
@@ -46,8 +53,14 @@ class TrainedPolicy:
         weights = jax.tree.map(lambda leaf: jnp.asarray(leaf[place]), collection.weights_of(which, name))
         alone = of_one(collection, name, place, which)
         who = alone.agents[name][0]
-        greedy = partial(alone.algorithm(name).greedy, alone.hyper(name, who), weights)
-        return cls(name, who, alone.n_devices, alone, jax.jit(greedy))
+        algorithm, hyper = alone.algorithm(name), alone.hyper(name, who)
+        n_devices = None if sees_all(alone.settings[name]) else alone.n_devices
+        greedy = partial(algorithm.greedy, hyper, weights)
+        appraise = None
+        if (critic := algorithm.critic) is not None:
+            appraise = jax.jit(lambda *scene: critic(hyper, weights, algorithm.see(*scene)))
+        act = jax.jit(algorithm.policy(hyper, weights))
+        return cls(name, who, n_devices, alone, act, jax.jit(greedy), appraise)
 
     def __call__(self, params: Params, layout: Layout, state: State, key: Any = None) -> Array:
         """The device to visit, int32 ``[...]``, in states with any batch axes in front.
@@ -55,15 +68,19 @@ class TrainedPolicy:
         Raises:
             PolicyError: the layout has another number of devices.
         """
-        if layout.capacity.shape[-1] != self.n_devices:
+        if self.n_devices not in (None, layout.capacity.shape[-1]):
             raise PolicyError(
                 f"the policy was trained for {self.n_devices} devices; the layout has {layout.capacity.shape[-1]}"
             )
-        chosen: Array = self._greedy(observe(layout, state))
+        chosen: Array = self._act(params, layout, state)
         return chosen
 
     def act(self, observation: Any) -> np.ndarray:
-        """The device to visit for observations ``[..., 2n]``: NumPy in, NumPy int32 ``[...]`` out.
+        """The device to visit for observations ``[..., words]``: NumPy in, NumPy int32 ``[...]`` out.
+
+        Args:
+            observation: the paper's, ``2n`` words; of a policy that plays any number of devices the full one, for each
+                device its features and a 1 behind them.
 
         Raises:
             PolicyError: the observation has another shape, or holds what is no number.
@@ -72,10 +89,31 @@ class TrainedPolicy:
             given = np.asarray(observation, np.float32)
         except (TypeError, ValueError) as error:
             raise PolicyError(f"the observation is not an array of numbers: {error}") from None
-        size = 2 * self.n_devices
-        if given.shape[-1:] != (size,):
-            raise PolicyError(f"the observation has the shape {given.shape}; it should be ({size},) or (..., {size})")
+        size = 2 * self.n_devices if self.n_devices else len(FEATURES) + 1
+        words = given.shape[-1] if given.ndim else 0
+        if words != size and (self.n_devices or words == 0 or words % size):
+            wanted = f"({size},) or (..., {size})" if self.n_devices else f"(..., {size} for each device)"
+            raise PolicyError(f"the observation has the shape {given.shape}; it should be {wanted}")
         return np.asarray(self._greedy(given))
+
+    def appraise(self, params: Params, layout: Layout, states: State) -> Array:
+        """What the critic says the rest of an episode is worth, f32 ``[B]``, in states with one batch axis.
+
+        Raises:
+            PolicyError: it was trained without a critic.
+        """
+        if self._appraise is None:
+            raise PolicyError(f"{self.algorithm} has no critic; PPO and A2C have one")
+        worth: Array = self._appraise(params, layout, states)
+        return worth
+
+    def unlike_training(self, params: Params, layout: Layout) -> list[str]:
+        """In what a scenario lies outside those that the policy was trained on: a line each; none if it is like them.
+
+        Of a policy that was trained on one scenario only nothing is known.
+        """
+        drawn = self.collection.drawn
+        return unlike(drawn["scenarios"], drawn["params"], params, layout) if drawn else []
 
     def save(self, path: str | Path) -> None:
         """Write the policy to a file of its own (``.npz``), whole or not at all."""
@@ -86,7 +124,7 @@ def load_policy(source: str | Path, which: str = "best", **axes: Any) -> Policy:
     """A policy by name, from a file, or of one agent of a run.
 
     Args:
-        source: a name in :data:`HEURISTICS`, ``"rollout"``, a policy file, or the folder of a run.
+        source: ``"generalist"``, a name in :data:`HEURISTICS`, ``"rollout"``, a policy file, or the folder of a run.
         which: ``"best"`` or ``"last"`` weights of a run's agent; a policy file has one kind.
         axes: which agent of a run, e.g. ``powered=8, connected=8, seed=3, algorithm="ppo"``; what tells no agents apart
             may be left out.
@@ -102,12 +140,13 @@ def load_policy(source: str | Path, which: str = "best", **axes: Any) -> Policy:
         return HEURISTICS[str(source)]
     if str(source) == "rollout":
         return rollout_planner()
-    path = Path(source)
+    shipped = {Path(file.name).stem: file for file in _SHIPPED.iterdir() if file.name.endswith(".npz")}
+    path = Path(str(shipped.get(str(source), source)))
     if path.is_dir():
         path = path / WEIGHTS
     elif not path.exists() and not path.suffix:
         raise PolicyError(
-            f"{source}: neither a file nor a policy by name; {nearest(str(source), [*HEURISTICS, 'rollout'])}"
+            f"{source}: neither a file nor a policy by name; {nearest(str(source), [*shipped, *HEURISTICS, 'rollout'])}"
         )
     collection = read_collection(path)
     kinds = {key.split("/")[1] for key in collection.weights}

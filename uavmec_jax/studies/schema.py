@@ -14,6 +14,7 @@ from pydantic import Field
 from uavmec_jax.learning.registry import ALGORITHMS, OF_THE_SCENARIO
 from uavmec_jax.planning.beam import WIDTH as BEAM_WIDTH
 from uavmec_jax.planning.lookahead import SAMPLES as ROLLOUT_SAMPLES
+from uavmec_jax.studies.drawn import ScenarioSettings, check_scenarios
 from uavmec_jax.world.params import Params
 from uavmec_jax.world.rewards import DEFAULT_REWARD, LOG_GUARDS, REWARDS, TERMS
 from uavmec_jax.world.settings import ParamsSettings, Strict, check_ranges, nearest, settings_model, wanted
@@ -94,6 +95,10 @@ class Study(Strict):
     """Added to the reward when a device is visited, times its traffic weight."""
     traffic_penalty: Annotated[float, Field(ge=0)] = 0.0
     """Taken off the reward when a device is the first to fail, times its traffic weight."""
+    slot_reward: Annotated[float, Field(ge=0)] = 0.0
+    """Added to the reward for every slot that counts."""
+    scenarios: ScenarioSettings | None = None
+    """What every episode draws a scenario of its own from, in place of the axes ``powered`` and ``connected``."""
     axes: dict[str, Any]
     """``powered`` and ``connected``, or ``cells`` (pairs of the two); ``seeds`` (a number or a list); ``algorithm``,
     ``reward``, ``guard``, ``place``, ``traffic_bonus``, ``traffic_penalty``, any traced setting."""
@@ -117,6 +122,7 @@ class Study(Strict):
         _check_axes(self)
         _check_traffic(self)
         check_ranges(self.params, "params.")
+        _check_drawn(self)
         _check_algorithms(self)
         if self.algorithm == "none" and not self.evaluation.baselines + self.evaluation.planners:
             raise ValueError("algorithm is 'none' and evaluation has neither baselines nor planners; name one to judge")
@@ -131,6 +137,18 @@ def _check_reward(where: str, reward: Any) -> None:
         for term in reward:
             if term not in TERMS:
                 raise ValueError(f"{where} has the term {term!r}, which is not one; {nearest(term, TERMS)}")
+
+
+def _check_drawn(study: Study) -> None:
+    """Drawn scenarios stand where an algorithm can play them, and beside nothing that they would overrule."""
+    if study.scenarios is None:
+        return
+    check_scenarios(study.scenarios, study.params.n_devices)
+    if "dqn" in study.algorithms:
+        raise ValueError("scenarios are given, and algorithm is 'dqn', which plays one scenario; take 'ppo' or 'a2c'")
+    for name in ("place", "traffic_bonus", "traffic_penalty"):
+        if getattr(study, name) or name in study.axes:
+            raise ValueError(f"{name} is given, and scenarios too, which draw their own; leave one of them out")
 
 
 def _check_traffic(study: Study) -> None:
@@ -178,7 +196,11 @@ def _check_axes(study: Study) -> None:
     """Every axis is known, not empty, without repeats, and its values would be valid settings themselves."""
     if "cells" in study.axes and {"powered", "connected"} & set(study.axes):
         raise ValueError("axes.cells stands beside axes.powered or axes.connected; give the pairs or the two lists")
-    for name in ("seeds",) if "cells" in study.axes else ("powered", "connected", "seeds"):
+    counts = ("powered", "connected", "cells")
+    if study.scenarios is not None and (given := [name for name in counts if name in study.axes]):
+        raise ValueError(f"axes.{given[0]} is given, and scenarios too, which draw their own; leave one of them out")
+    drawn_or_cells = "cells" in study.axes or study.scenarios is not None
+    for name in ("seeds",) if drawn_or_cells else ("powered", "connected", "seeds"):
         if name not in study.axes:
             raise ValueError(f"axes.{name} is missing; give a list of whole numbers")
     for name, values in study.axes.items():

@@ -33,8 +33,8 @@ from uavmec_jax.world.rewards import Reward, make_reward
 SCHEMA = 1
 """Version of a finished shard's file."""
 
-_WHAT_IS_PLAYED = ("seed", "powered", "connected", "place", *TRACED_PARAMS)
-"""Columns that say what an agent plays; all others say how it learns."""
+_WHAT_IS_PLAYED = ("seed", "powered", "connected", "scenarios", "place", *TRACED_PARAMS)
+"""Columns that say what an agent plays; all others say how it learns (as the seed does where scenarios are drawn)."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,10 @@ class _Part:
         keys = evaluation_keys(self.study, who)
         members, keys = jax.tree.map(lambda leaf: leaf[: shard.agents], (agents, keys))
         rows = pd.DataFrame(who[: shard.agents])
-        distinct = Distinct.of(rows[[name for name in rows if name in _WHAT_IS_PLAYED]])
+        drawn = "scenarios" in rows
+        distinct = Distinct.of(
+            rows[[name for name in rows if name in _WHAT_IS_PLAYED and not (drawn and name == "seed")]]
+        )
         if self.named:
             rows.insert(3, "algorithm", self.study.algorithm)
         weights: dict[str, Any] = {}

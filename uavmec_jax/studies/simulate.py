@@ -143,7 +143,7 @@ def _agent_bytes(study: Study) -> tuple[int, int]:
     if study.algorithm == "none":
         return 1000, episode * episodes
     declared = ALGORITHMS[study.algorithm]
-    network = declared.spec_of(getattr(study, study.algorithm).model_dump(), n_devices=n).network
+    spec = declared.spec_of(getattr(study, study.algorithm).model_dump(), n_devices=n)
     looks = study.steps // settings.validate_every + 1
     episodes += 2 * (settings.draws + 1)
-    return 2 * 4 * n_weights(network, 2 * n) + 1000, episode * episodes + 4 * 5 * looks
+    return 2 * 4 * n_weights(spec.network, spec.words) + 1000, episode * episodes + 4 * 5 * looks

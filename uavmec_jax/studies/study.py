@@ -19,8 +19,10 @@ from uavmec_jax.errors import StudyError
 from uavmec_jax.files import parse_toml
 from uavmec_jax.learning.algorithm import Agent, Algorithm
 from uavmec_jax.learning.registry import ALGORITHMS
+from uavmec_jax.studies.drawn import make_distribution
 from uavmec_jax.studies.places import onto_places
 from uavmec_jax.studies.schema import TRAFFIC_WEIGHTS, Study
+from uavmec_jax.world.distribution import ScenarioDistribution
 from uavmec_jax.world.environment import Scenario
 from uavmec_jax.world.layout import Layout, sample_layout
 from uavmec_jax.world.params import Params
@@ -88,7 +90,7 @@ def parse_study(text: str, source: str, overrides: Mapping[str, Any] | None = No
 
 def _listed(data: dict[str, Any]) -> dict[str, Any]:
     """TOML arrays as tuples where a setting is a tuple (the checks do not convert)."""
-    settings = (*ALGORITHMS, "params", "evaluation")
+    settings = (*ALGORITHMS, "params", "evaluation", "scenarios")
     return {key: tuples(value) if key in settings and isinstance(value, dict) else value for key, value in data.items()}
 
 
@@ -111,9 +113,9 @@ def seeds_of(study: Study) -> list[int]:
 
 
 def cell_axes(study: Study) -> list[str]:
-    """The axes that make a cell: all but the seeds, ``powered`` and ``connected`` first."""
+    """The axes that make a cell: all but the seeds, ``powered`` and ``connected`` (or ``scenarios``) first."""
     others = [name for name in study.axes if name not in ("powered", "connected", "cells", "seeds")]
-    return ["powered", "connected", *others]
+    return [*(("scenarios",) if study.scenarios else ("powered", "connected")), *others]
 
 
 def parts(study: Study) -> list[Study]:
@@ -133,22 +135,21 @@ def identities(study: Study) -> list[dict[str, Any]]:
         order = ["seed", *cell_axes(study)]
         everyone = [who | {"algorithm": part.algorithm} for part in parts(study) for who in identities(part)]
         return [{name: who[name] for name in order} for who in everyone]
-    names = ["seed", "cell", *cell_axes(study)[2:]]
-    axes: list[Iterable[Any]] = [seeds_of(study), _cells(study), *(study.axes[name] for name in names[2:])]
-    everyone = [dict(zip(names, values, strict=True)) for values in itertools.product(*axes)]
-    return [
-        {"seed": who["seed"], "powered": who["cell"][0], "connected": who["cell"][1]}
-        | {name: who[name] for name in names[2:]}
-        for who in everyone
-        if _says_something(study, who)
+    others = [name for name in cell_axes(study) if name in study.axes and name not in ("powered", "connected")]
+    axes: list[Iterable[Any]] = [seeds_of(study), _cells(study), *(study.axes[name] for name in others)]
+    everyone = [
+        {"seed": seed} | cell | dict(zip(others, values, strict=True))
+        for seed, cell, *values in itertools.product(*axes)
     ]
+    return [who for who in everyone if _says_something(study, who)]
 
 
-def _cells(study: Study) -> list[tuple[int, int]]:
-    """Pairs of powered and connected devices."""
-    if "cells" in study.axes:
-        return [(powered, connected) for powered, connected in study.axes["cells"]]
-    return list(itertools.product(study.axes["powered"], study.axes["connected"]))
+def _cells(study: Study) -> list[dict[str, Any]]:
+    """Counts of powered and connected devices; or that they are drawn."""
+    if study.scenarios is not None:
+        return [{"scenarios": "drawn"}]
+    pairs = study.axes.get("cells") or itertools.product(study.axes["powered"], study.axes["connected"])
+    return [{"powered": powered, "connected": connected} for powered, connected in pairs]
 
 
 def _says_something(study: Study, who: Mapping[str, Any]) -> bool:
@@ -210,15 +211,18 @@ def make_agents(study: Study, reward: Reward | None = None, who: Who | None = No
 
     settings: dict[str, Any] = {name: spread(name, value) for name, value in study.params.model_dump().items()}
     params = Params(**settings)
-    layout = onto_places(_towns(seeds, params, powered, connected), who, study)
-    rewards = [_reward_of(study, agent, reward) for agent in who]
+    rewards = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(_reward_of(study, agent, reward) for agent in who))
+    plays: Scenario | ScenarioDistribution
+    if study.scenarios is None:
+        layout = onto_places(_towns(seeds, params, powered, connected), who, study)
+        plays = Scenario(params=params, layout=layout, reward=rewards)
+    else:
+        plays = make_distribution(study.scenarios, params, rewards, len(who))
     declared = ALGORITHMS["dqn" if study.algorithm == "none" else study.algorithm]
     own = getattr(study, "dqn" if study.algorithm == "none" else study.algorithm)
     return Agent(
         key=_agent_keys(_TRAINING, seeds, powered, connected),
-        scenario=Scenario(
-            params=params, layout=layout, reward=jax.tree.map(lambda *leaves: jnp.stack(leaves), *rewards)
-        ),
+        scenario=plays,
         hyper=declared.hyper(**{name: leaf(name, getattr(own, name)) for name in declared.traced}),
     )
 
@@ -228,7 +232,7 @@ def _reward_of(study: Study, agent: Mapping[str, Any], reward: Reward | None) ->
     if reward is None:
         reward = make_reward(agent.get("reward", study.reward), agent.get("guard", study.guard))
     traffic = {name: jnp.float32(agent.get(name, getattr(study, name))) for name in TRAFFIC_WEIGHTS}
-    return replace(reward, **traffic)
+    return replace(reward, per_slot=jnp.float32(study.slot_reward), **traffic)
 
 
 def town(seed: Any, params: Params, n_powered: Any, n_connected: Any) -> Layout:
@@ -259,6 +263,8 @@ def evaluation_keys(study: Study, who: Who | None = None) -> Any:
 
 def _draw_keys(study: Study, stream: int, draws: int, who: Who | None) -> Any:
     who = identities(study) if who is None else who
+    if study.scenarios is not None:  # all agents are judged in the same scenarios
+        who = [{"seed": 0}] * len(who)
     keys = _agent_keys(stream, *(_column(who, name) for name in ("seed", "powered", "connected")))
     return _split(keys, draws)
 
@@ -280,4 +286,5 @@ def _agent_keys(stream: int, *numbers: Any) -> Any:
 
 
 def _column(who: Who, name: str) -> np.ndarray:
-    return np.array([agent[name] for agent in who], np.int32)
+    """One number of every agent's identity; 0 where it has none: drawn scenarios have no counts of devices."""
+    return np.array([agent.get(name, 0) for agent in who], np.int32)

@@ -1,7 +1,9 @@
 """The environment a learner sees: scenarios, observations, and the signatures of gymnax 1.0."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -65,6 +67,12 @@ def restart_if(ended: Bool[Array, ""], scenario: Scenario, state: State) -> Stat
     return jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, state)
 
 
+def observe_as_paper(params: Params, layout: Layout, state: State) -> Float[Array, "*b two_n"]:
+    """:func:`observe`, called as every way to see is."""
+    return observe(layout, state)
+
+
+@dataclass(frozen=True)
 class UavMecEnv:
     """UAV-assisted edge computing as an environment with the signatures of gymnax 1.0.
 
@@ -72,9 +80,14 @@ class UavMecEnv:
     Reward: see :mod:`uavmec_jax.world.rewards`. ``params`` is a :class:`Scenario`, batched by ``vmap``.
     The state is a :class:`State`; ``step`` resets by itself when an episode ends and then reports the true last
     observation as ``info["final_observation"]``.
+
+    Attributes:
+        see: ``(params, layout, state) -> observation``, an array or a pytree; by default the paper's.
+            :func:`uavmec_jax.observe_devices` is the full one.
     """
 
-    name = "UavMec"
+    see: Callable[[Params, Layout, State], Any] = observe_as_paper
+    name: ClassVar[str] = "UavMec"
 
     @property
     def default_params(self) -> Scenario:
@@ -85,22 +98,23 @@ class UavMecEnv:
         """Number of actions, one per device."""
         return params.layout.capacity.shape[-1]
 
-    def observation_shape(self, params: Scenario) -> tuple[int]:
-        """Shape of an observation."""
-        return (2 * self.num_actions(params),)
+    def observation_shape(self, params: Scenario) -> Any:
+        """Shape of an observation; of one that is a pytree, the tree of its leaves' shapes."""
+        state = jax.eval_shape(initial_state, params.params, params.layout)
+        return jax.tree.map(lambda leaf: leaf.shape, jax.eval_shape(self.see, params.params, params.layout, state))
 
     @partial(jax.jit, static_argnames=("self",))
-    def reset(self, key: PRNGKeyArray, params: Scenario | None = None) -> tuple[Array, State]:
+    def reset(self, key: PRNGKeyArray, params: Scenario | None = None) -> tuple[Any, State]:
         """Start an episode: observation and state. Nothing in it is random; volumes are drawn per slot."""
         del key
         scenario = self.default_params if params is None else params
         state = initial_state(scenario.params, scenario.layout)
-        return observe(scenario.layout, state), state
+        return self._seen(scenario, state), state
 
     @partial(jax.jit, static_argnames=("self",))
     def step(
         self, key: PRNGKeyArray, state: State, action: Any, params: Scenario | None = None
-    ) -> tuple[Array, State, Array, Array, Array, dict[str, Array]]:
+    ) -> tuple[Any, State, Array, Array, Array, dict[str, Any]]:
         """Play one slot with volumes drawn from ``key``.
 
         Returns:
@@ -114,7 +128,7 @@ class UavMecEnv:
         after, reward, outcome = advance(scenario, state, jnp.asarray(action, jnp.int32), volumes)
         terminated = outcome.cause != Cause.NONE
         truncated = is_truncated(scenario, after, outcome)
-        final_observation = observe(layout, after)
+        final_observation = self._seen(scenario, after)
         next_state = restart_if(terminated | truncated, scenario, after)
         info = {
             "terminated": terminated,
@@ -127,4 +141,7 @@ class UavMecEnv:
             "first_failure": outcome.first_failure,
             "length": after.slot,
         }
-        return observe(layout, next_state), next_state, reward, terminated, truncated, info
+        return self._seen(scenario, next_state), next_state, reward, terminated, truncated, info
+
+    def _seen(self, scenario: Scenario, state: State) -> Any:
+        return self.see(scenario.params, scenario.layout, state)

@@ -1,6 +1,7 @@
 """Layouts: what one random draw, or one user's inventory, fixes about the devices."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -19,10 +20,13 @@ class Traffic:
     Attributes:
         weight: ``[W, n]`` in [0, 1], one row for each window of the evacuation; one row alone stands for all of it.
         window_s: s, length of a window; the first one begins with the first slot, the last one lasts.
+        price: slots of life that a planner would give for a device in the densest traffic not to be the first to fail,
+            less for others in proportion; what a policy that knows the full observation aims at.
     """
 
     weight: Any
     window_s: Any = math.inf
+    price: Any = 0.0
 
     def at(self, seconds: Any) -> Any:
         """Weights ``[n]`` at a time in seconds since the first slot began."""
@@ -47,6 +51,7 @@ class Layout:
         active_power: ``[n]`` W, from type and task.
         processing_rate: ``[n]`` bytes/s, from type and task.
         traffic: what traffic they see, or ``None``: nobody knows.
+        present: ``[n]`` bool, which entries are devices, the others fill up (:func:`pad_layout`); ``None``: all are.
     """
 
     position: Any
@@ -59,6 +64,7 @@ class Layout:
     active_power: Any
     processing_rate: Any
     traffic: Traffic | None = None
+    present: Any = None
 
 
 def make_layout(
@@ -109,3 +115,48 @@ def sample_layout(key: PRNGKeyArray, params: Params, n_powered: Any, n_connected
         has_power=jax.random.permutation(k_power, n) < n_powered,
         has_comms=jax.random.permutation(k_comms, n) < n_connected,
     )
+
+
+_NOWHERE_M = 1e6
+"""Where entries stand that are no devices: out of everybody's range and beyond the UAV's battery."""
+
+
+def only_present(layout: Layout, present: Bool[Array, " n"]) -> Layout:
+    """The layout with the entries that are not ``present`` made harmless: they lack nothing, do nothing and are far away.
+
+    Every function of the package then treats them rightly without knowing of them; who offers actions masks them.
+    """
+    keep = lambda value, otherwise: jnp.where(present, value, otherwise)  # noqa: E731
+    return replace(
+        layout,
+        position=jnp.where(present[:, None], layout.position, _NOWHERE_M),
+        capacity=keep(layout.capacity, 1.0),
+        has_power=layout.has_power | ~present,
+        has_comms=layout.has_comms | ~present,
+        standby_power=keep(layout.standby_power, 0.0),
+        active_power=keep(layout.active_power, 0.0),
+        processing_rate=keep(layout.processing_rate, jnp.inf),
+        present=present,
+    )
+
+
+def pad_layout(layout: Layout, size: int) -> Layout:
+    """The layout with entries that are no devices behind it, so that layouts of different counts fit into one batch.
+
+    Args:
+        layout: ``n`` devices.
+        size: entries wanted, at least ``n``.
+
+    Raises:
+        ValueError: there are more devices.
+    """
+    n = layout.capacity.shape[0]
+    if n > size:
+        raise ValueError(f"the layout has {n} devices; they do not fit into {size}")
+    fill = lambda leaf: jnp.pad(jnp.asarray(leaf), ((0, size - n),) + ((0, 0),) * (jnp.ndim(leaf) - 1))  # noqa: E731
+    present = jnp.ones(n, bool) if layout.present is None else layout.present
+    traffic = layout.traffic
+    if traffic is not None:
+        traffic = replace(traffic, weight=jnp.pad(jnp.asarray(traffic.weight), ((0, 0), (0, size - n))))
+    bare = jax.tree.map(fill, replace(layout, traffic=None, present=None))
+    return only_present(replace(bare, traffic=traffic), fill(present))

@@ -75,6 +75,7 @@ class Reward:
         traffic_bonus: added once for a device in the densest traffic when it is visited, less for others, in proportion
             to their traffic (paper, section 5.1).
         traffic_penalty: taken off, in the same proportion, for the device that fails first.
+        per_slot: added for every slot that counts; with nothing else, the sum of the rewards is the lifetime.
     """
 
     weights: Any
@@ -82,6 +83,7 @@ class Reward:
     function: Callable[[Mapping[str, Any]], Any] | None = struct.field(pytree_node=False, default=None)
     traffic_bonus: Any = 0.0
     traffic_penalty: Any = 0.0
+    per_slot: Any = 0.0
 
 
 def make_reward(
@@ -90,6 +92,7 @@ def make_reward(
     *,
     traffic_bonus: float = 0.0,
     traffic_penalty: float = 0.0,
+    per_slot: float = 0.0,
 ) -> Reward:
     """Return a :class:`Reward` from a name of Table 6, from weights of one's own, or from a function.
 
@@ -99,6 +102,7 @@ def make_reward(
         guard: one of :data:`LOG_GUARDS`.
         traffic_bonus: see :class:`Reward`; has an effect where the layout knows its traffic.
         traffic_penalty: likewise.
+        per_slot: added for every slot that counts; ``make_reward({}, per_slot=1.0)`` is the lifetime.
 
     Raises:
         ValueError: unknown name, term or guard; or the function does not return a scalar.
@@ -109,6 +113,7 @@ def make_reward(
         "log1p": jnp.asarray(guard == "log1p"),
         "traffic_bonus": jnp.float32(traffic_bonus),
         "traffic_penalty": jnp.float32(traffic_penalty),
+        "per_slot": jnp.float32(per_slot),
     }
     if callable(reward):
         _check_function(reward)
@@ -157,9 +162,10 @@ def reward_of(
 ) -> Float[Array, ""]:
     """The scalar reward of one slot."""
     terms = reward_terms(layout, before, action, after, reward.log1p)
+    survival = reward.per_slot * (after.slot - before.slot)
     if reward.function is not None:
-        return jnp.asarray(reward.function(dict(zip(TERMS, terms, strict=True))), jnp.float32)
-    return jnp.dot(reward.weights, terms)
+        return jnp.asarray(reward.function(dict(zip(TERMS, terms, strict=True))), jnp.float32) + survival
+    return jnp.dot(reward.weights, terms) + survival
 
 
 def traffic_reward(

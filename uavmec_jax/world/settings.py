@@ -4,7 +4,7 @@ import dataclasses
 import difflib
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field, create_model
@@ -21,6 +21,8 @@ class Strict(BaseModel):
 def _field(field: dataclasses.Field) -> Any:
     """Type and bounds of one setting, from its default and its metadata."""
     default, bounds = field.default, {k: v for k, v in field.metadata.items() if k in ("gt", "ge", "lt", "le")}
+    if "choices" in field.metadata:
+        return Literal[field.metadata["choices"]], default
     if isinstance(default, bool):
         return bool, default
     if isinstance(default, int):

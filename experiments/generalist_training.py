@@ -1,0 +1,237 @@
+"""How soon the generalist is good, and whether it should learn from the beam's actions first.
+
+    uv run python experiments/generalist_training.py [--scenarios 3000] [--out results/generalist]
+
+The study `generalist` is trained by PPO alone, and again after learning from the clairvoyant beam: the beam plays drawn
+scenarios, and the networks learn its visits (cross-entropy) and what it still lives (squared error). At every look both
+play the 25 cells of unseen towns. Beside them stands the paper's DQN, which learns each town by itself (`results/table5`, at
+the speed of one agent alone, `results/benchmark`). Writes `training.json` and `training.png`.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from uavmec_jax.studies import host
+
+host.use_every_core()
+
+import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+
+from uavmec_jax.learning import on_policy  # noqa: E402
+from uavmec_jax.learning.estimates import log_probability  # noqa: E402
+from uavmec_jax.learning.optimizers import Descent, clipped_adam, descend  # noqa: E402
+from uavmec_jax.learning.registry import ALGORITHMS  # noqa: E402
+from uavmec_jax.learning.training import Trainer, Training, Validation  # noqa: E402
+from uavmec_jax.planning.beam import WIDTH, beam_search, horizon  # noqa: E402
+from uavmec_jax.planning.parallel import spread  # noqa: E402
+from uavmec_jax.reporting.generalist import training_figure  # noqa: E402
+from uavmec_jax.studies.archive import load_results  # noqa: E402
+from uavmec_jax.studies.plan import plan_study  # noqa: E402
+from uavmec_jax.studies.schema import Study  # noqa: E402
+from uavmec_jax.studies.study import (  # noqa: E402
+    evaluation_keys,
+    load_study,
+    make_agents,
+    make_algorithm,
+    validation_keys,
+)
+from uavmec_jax.world.distribution import ScenarioDistribution, scenario_of_draw  # noqa: E402
+from uavmec_jax.world.physics import initial_state  # noqa: E402
+from uavmec_jax.world.rollout import rollouts, tour_policy, trace, volume_table  # noqa: E402
+
+_OPTIMIZER = clipped_adam(eps=1e-5)
+_BATCH = 1024
+_TEACHER = 20_000
+"""Seed of the scenarios that the beam plays."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenarios", type=int, default=3000, help="that the beam plays")
+    parser.add_argument("--epochs", type=int, default=20, help="passes over its visits")
+    parser.add_argument("--steps", type=int, help="environment steps of PPO (default: the study's)")
+    parser.add_argument("--towns", type=int, default=20, help="in each of the 25 cells")
+    parser.add_argument("--out", type=Path, default=Path("results/generalist"))
+    arguments = parser.parse_args()
+
+    more = {"steps": arguments.steps} if arguments.steps else {}
+    study = load_study("generalist", {"evaluation.validate_every": 250_000, **more})
+    judge, lines = grid(study, arguments.towns)
+    alone = train(start(study), judge)
+
+    tick = time.perf_counter()
+    distribution = jax.tree.map(lambda leaf: leaf[0], make_agents(study).scenario)
+    lessons = collect(study, distribution, arguments.scenarios)
+    collected = time.perf_counter() - tick
+    seeds = len(study.axes["seeds"]) if isinstance(study.axes["seeds"], list) else study.axes["seeds"]
+    weights = [imitate(study, lessons, seed, arguments.epochs) for seed in range(seeds)]
+    learned = time.perf_counter() - tick - collected
+    gentle = load_study("generalist", {"ppo.learning_rate": study.ppo.learning_rate / 3, **more})
+    taught = train(teach(start(gentle), weights), judge, begun_s=collected + learned)
+
+    report = {
+        "command": "uv run python experiments/generalist_training.py",
+        "steps": study.steps,
+        "seeds": seeds,
+        "beam": {"scenarios": arguments.scenarios, "visits": len(lessons[1]), "seconds": round(collected, 1)},
+        "imitation_seconds": round(learned, 1),
+        "imitation_slots": np.round(judge(jax.tree.map(lambda *leaves: jnp.stack(leaves), *weights)), 3).tolist(),
+        "ppo": alone.report(),
+        "imitation_then_ppo": taught.report(),
+        "towns": 25 * arguments.towns,
+        "lines": lines,
+        "dqn": paper_dqn(),
+        **host.describe(),
+    }
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    (arguments.out / "training.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    training_figure(report, arguments.out / "training.png")
+    shown = ("beam", "imitation_seconds", "imitation_slots", "ppo", "imitation_then_ppo", "lines")
+    print(json.dumps({name: report[name] for name in shown}, indent=1))
+
+
+@dataclass
+class Run:
+    """A study's agents in training, and how good they were at every look: slots, a number for each seed."""
+
+    training: Training
+    seconds: list[float] = field(default_factory=list)
+    slots: list[np.ndarray] = field(default_factory=list)
+
+    def report(self) -> dict[str, Any]:
+        """Plain data."""
+        return {
+            "seconds": np.round(self.seconds, 1).tolist(),
+            "slots": np.round(np.mean(self.slots, axis=1), 3).tolist(),
+            "slots_by_seed": np.round(self.slots, 3).T.tolist(),
+            "validation": np.round(np.stack(self.training.scores, 1), 3).tolist(),
+            "best_validation": np.round(self.training.best_scores, 3).tolist(),
+        }
+
+
+def start(study: Study) -> Run:
+    """The agents before their first step."""
+    algorithm, agents, keys = make_algorithm(study), make_agents(study), validation_keys(study)
+    assert algorithm is not None
+    settings, blocks = study.evaluation, plan_study(study).blocks["ppo"]
+    validation = Validation(every=settings.validate_every, draws=settings.validation_draws, chunks=1)
+    return Run(Trainer.compile(algorithm, agents, keys, validation, blocks).start(agents, keys))
+
+
+def train(run: Run, judge: Callable[[Any], np.ndarray], begun_s: float = 0.0) -> Run:
+    """To the end, judged at every look; the seconds are those of training and validation."""
+    while not run.training.finished:
+        run.training.advance()
+        run.seconds.append(begun_s + sum(run.training.seconds[name] for name in ("train", "validate")))
+        waves = [jax.tree.map(np.asarray, wave.state.weights) for wave in run.training.waves]
+        run.slots.append(judge(jax.tree.map(lambda *leaves: np.concatenate(leaves), *waves)))
+    return run
+
+
+def grid(study: Study, towns: int) -> tuple[Callable[[Any], np.ndarray], dict[str, float]]:
+    """What says how long weights ``[seeds, ...]`` live on the unseen towns of the study `planning`, and others there."""
+    planning = load_study("planning", {"axes.seeds": towns})
+    scenario, keys = make_agents(planning).scenario, evaluation_keys(planning)[:, :1]
+    algorithm = make_algorithm(study)
+    hyper = jax.tree.map(lambda leaf: leaf[0], make_agents(study).hyper)
+    assert algorithm is not None
+
+    @jax.jit
+    def slots(weights: Any) -> Any:
+        policy = algorithm.policy(hyper, weights)
+        one = lambda *town: rollouts(policy, *town).length  # noqa: E731
+        return jnp.mean(spread(one, scenario.params, scenario.layout, keys, batch=64).astype(jnp.float32))
+
+    def judge(weights: Any) -> np.ndarray:
+        count = jax.tree.leaves(weights)[0].shape[0]
+        return np.array([float(slots(jax.tree.map(lambda leaf, i=i: leaf[i], weights))) for i in range(count)])
+
+    others = load_results(Path("results/planning")).evaluation
+    names = ("oldest_first", "earliest_deadline", "bound")
+    return judge, {name: round(float(others[f"{name}/lifetime"][: len(keys), 0].mean()), 3) for name in names}
+
+
+def collect(study: Study, distribution: ScenarioDistribution, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Observations ``[N, words]``, the beam's visits ``[N]`` and the slots it still lives ``[N]``."""
+    keys = jax.random.split(jax.random.key(_TEACHER), count)
+    scenarios = jax.jit(jax.vmap(partial(scenario_of_draw, distribution)))(keys)
+    slots, see = horizon(scenarios.params, scenarios.layout), spec_of(study).perception.see
+
+    def one(params: Any, layout: Any, key: Any) -> tuple[Any, ...]:
+        volumes = volume_table(params, layout.capacity.shape[0], key, slots)
+        tour = beam_search(params, layout, volumes, WIDTH)
+        played = trace(tour_policy(tour.actions), params, layout, key, slots)
+        first = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], initial_state(params, layout))
+        before = jax.tree.map(lambda begun, leaf: jnp.concatenate([begun, leaf[:-1]]), first, played.state)
+        return see(params, layout, before), played.action, tour.lifetime - before.slot, played.played
+
+    found = jax.jit(lambda *those: spread(one, *those))(scenarios.params, scenarios.layout, keys)
+    seen, visits, left, real = (np.asarray(leaf) for leaf in found)
+    return seen[real], visits[real], left[real].astype(np.float32)
+
+
+def spec_of(study: Study) -> Any:
+    """The static settings of the study's PPO."""
+    return ALGORITHMS["ppo"].spec_of(study.ppo.model_dump(), total_steps=study.steps, n_devices=study.params.n_devices)
+
+
+def imitate(study: Study, lessons: tuple[np.ndarray, ...], seed: int, epochs: int) -> Any:
+    """Weights that make the beam's visits likely, and say what it still lives, in the study's reward."""
+    spec, gamma = spec_of(study), study.ppo.gamma
+    hyper = on_policy.OnPolicyHyper(gamma=gamma)
+    weights = spec.network.init(jax.random.key(seed), jnp.zeros((1, spec.words)))
+    seen, visits, left = (jnp.asarray(part) for part in lessons)
+    worth = study.slot_reward * (1.0 - gamma**left) / (1.0 - gamma)
+    updates = max(epochs * len(visits) // _BATCH, 1)
+
+    def loss_of(weights: Any, chosen: Any) -> Any:
+        scores, values = on_policy.both(spec, hyper, weights, seen[chosen])
+        likely, _ = log_probability(scores, visits[chosen])
+        return -jnp.mean(likely) + 0.5 * jnp.mean(jnp.square(values - worth[chosen]))
+
+    def step(number: Any, descent: Descent) -> Descent:
+        chosen = jax.random.randint(jax.random.fold_in(jax.random.key(seed), number), (_BATCH,), 0, len(visits))
+        loss, gradient = jax.value_and_grad(loss_of)(descent.weights, chosen)
+        rate = study.ppo.learning_rate * 0.1 ** (number / updates)
+        settings: dict[str, Any] = {"learning_rate": rate, "max_norm": 0.5, "count": number + 1, "steps_done": number}
+        return descend(_OPTIMIZER, descent, loss, gradient, **settings)
+
+    begun = Descent(weights, _OPTIMIZER.init(weights), jnp.int32(-1))
+    return jax.jit(lambda descent: jax.lax.fori_loop(0, updates, step, descent))(begun).weights
+
+
+def teach(run: Run, weights: list[Any]) -> Run:
+    """Give every agent the weights that it starts from."""
+    stacked, first = jax.tree.map(lambda *leaves: np.stack(leaves), *weights), 0
+    for wave in run.training.waves:
+        size = wave.state.diverged_at.shape[0]
+        part = jax.tree.map(lambda leaf, first=first, size=size: leaf[first : first + size], stacked)
+        placed = jax.tree.map(lambda new, old: jax.device_put(new, old.sharding), part, wave.state.weights)
+        wave.state = replace(wave.state, weights=placed)
+        first += size
+    return run
+
+
+def paper_dqn() -> dict[str, Any]:
+    """Validation lifetimes of the agents of `results/table5`, and the seconds that one of them takes alone."""
+    curves = load_results(Path("results/table5")).curves["dqn"]
+    rows = json.loads(Path("results/benchmark/benchmark_dqn.json").read_text(encoding="utf-8"))["training"]
+    speed = next(row["steps_per_second"] for row in rows if row["agents"] == 1)
+    chosen = np.unique(np.geomspace(1, len(curves["look_steps"]), 12).astype(int)) - 1
+    return {
+        "seconds": np.round(curves["look_steps"][chosen] / speed, 2).tolist(),
+        "slots": np.round(curves["validation"][:, chosen].mean(axis=0), 3).tolist(),
+        "towns": len(curves["validation"]),
+    }
+
+
+if __name__ == "__main__":
+    main()

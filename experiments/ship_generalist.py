@@ -1,0 +1,43 @@
+"""Train the generalist and put it into the package: `um.load_policy("generalist")` is then what this run has learned.
+
+    uv run python experiments/ship_generalist.py [--run runs/generalist] [--into FILE]
+
+Runs the study `generalist` (or goes on with the run that is there), takes the agent that was best on the validation
+scenarios, and writes its best weights with all that makes them a policy. `uavmec_jax/studies/library/generalist.md` is the
+model card.
+"""
+
+import argparse
+from pathlib import Path
+
+from uavmec_jax.studies import host
+
+host.use_every_core()
+
+from uavmec_jax.studies.policies import TrainedPolicy, load_policy  # noqa: E402
+from uavmec_jax.studies.run import run_or_resume  # noqa: E402
+from uavmec_jax.studies.study import load_study  # noqa: E402
+
+PACKAGED = Path(__file__).parents[1] / "uavmec_jax" / "studies" / "library" / "generalist.npz"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--run", type=Path, default=Path("runs/generalist"), help="folder of the run")
+    parser.add_argument("--into", type=Path, default=PACKAGED, help="file that is written")
+    parser.add_argument("--steps", type=int, help="environment steps of one agent (default: the study's)")
+    arguments = parser.parse_args()
+
+    study = load_study("generalist", {"steps": arguments.steps} if arguments.steps else {})
+    results = run_or_resume(study, arguments.run, command="uv run python experiments/ship_generalist.py")
+    best = results.agents.loc[results.agents["best_validation"].idxmax()]
+    policy = load_policy(arguments.run, "best", seed=int(best["seed"]))
+    assert isinstance(policy, TrainedPolicy)
+    policy.save(arguments.into)
+    table = results.agents[["seed", "best_step", "best_validation", "best_lifetime", "earliest_deadline_lifetime"]]
+    print(table.to_string(index=False))
+    print(f"seed {best['seed']} -> {arguments.into}, {arguments.into.stat().st_size:,} bytes; {results.run['seconds']}")
+
+
+if __name__ == "__main__":
+    main()
