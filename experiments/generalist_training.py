@@ -30,7 +30,7 @@ from uavmec_jax.learning.estimates import log_probability  # noqa: E402
 from uavmec_jax.learning.optimizers import Descent, clipped_adam, descend  # noqa: E402
 from uavmec_jax.learning.registry import ALGORITHMS  # noqa: E402
 from uavmec_jax.learning.training import Trainer, Training, Validation  # noqa: E402
-from uavmec_jax.planning.beam import WIDTH, beam_search, horizon  # noqa: E402
+from uavmec_jax.planning.beam import WIDTH, beam_search, horizon, longest  # noqa: E402
 from uavmec_jax.planning.parallel import spread  # noqa: E402
 from uavmec_jax.reporting.generalist import training_figure  # noqa: E402
 from uavmec_jax.studies.archive import load_results  # noqa: E402
@@ -51,6 +51,8 @@ _OPTIMIZER = clipped_adam(eps=1e-5)
 _BATCH = 1024
 _TEACHER = 20_000
 """Seed of the scenarios that the beam plays."""
+_LONGEST = 64
+"""Slots that the UAV's battery may pay for in a scenario that the beam plays."""
 
 
 def main() -> None:
@@ -65,7 +67,8 @@ def main() -> None:
     more = {"steps": arguments.steps} if arguments.steps else {}
     study = load_study("generalist", {"evaluation.validate_every": 250_000, **more})
     judge, lines = grid(study, arguments.towns)
-    alone = train(start(study), judge)
+    trainer = compiled(study)
+    alone = train(start(trainer, study), judge)
 
     tick = time.perf_counter()
     distribution = jax.tree.map(lambda leaf: leaf[0], make_agents(study).scenario)
@@ -75,7 +78,7 @@ def main() -> None:
     weights = [imitate(study, lessons, seed, arguments.epochs) for seed in range(seeds)]
     learned = time.perf_counter() - tick - collected
     gentle = load_study("generalist", {"ppo.learning_rate": study.ppo.learning_rate / 3, **more})
-    taught = train(teach(start(gentle), weights), judge, begun_s=collected + learned)
+    taught = train(teach(start(trainer, gentle), weights), judge, begun_s=collected + learned)
 
     report = {
         "command": "uv run python experiments/generalist_training.py",
@@ -117,13 +120,18 @@ class Run:
         }
 
 
-def start(study: Study) -> Run:
-    """The agents before their first step."""
+def compiled(study: Study) -> Trainer:
+    """The programs that train the agents of the study, whatever their learning rate."""
     algorithm, agents, keys = make_algorithm(study), make_agents(study), validation_keys(study)
     assert algorithm is not None
     settings, blocks = study.evaluation, plan_study(study).blocks["ppo"]
     validation = Validation(every=settings.validate_every, draws=settings.validation_draws, chunks=1)
-    return Run(Trainer.compile(algorithm, agents, keys, validation, blocks).start(agents, keys))
+    return Trainer.compile(algorithm, agents, keys, validation, blocks)
+
+
+def start(trainer: Trainer, study: Study) -> Run:
+    """The agents of the study before their first step."""
+    return Run(trainer.start(make_agents(study), validation_keys(study)))
 
 
 def train(run: Run, judge: Callable[[Any], np.ndarray], begun_s: float = 0.0) -> Run:
@@ -161,8 +169,11 @@ def grid(study: Study, towns: int) -> tuple[Callable[[Any], np.ndarray], dict[st
 
 def collect(study: Study, distribution: ScenarioDistribution, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Observations ``[N, words]``, the beam's visits ``[N]`` and the slots it still lives ``[N]``."""
-    keys = jax.random.split(jax.random.key(_TEACHER), count)
+    keys = jax.random.split(jax.random.key(_TEACHER), 2 * count)
     scenarios = jax.jit(jax.vmap(partial(scenario_of_draw, distribution)))(keys)
+    # A few drawn scenarios can last for hundreds of slots, and the beam for hours on them.
+    short = np.flatnonzero(np.asarray(longest(scenarios.params, scenarios.layout)) <= _LONGEST)[:count]
+    scenarios, keys = jax.tree.map(lambda leaf: leaf[short], (scenarios, keys))
     slots, see = horizon(scenarios.params, scenarios.layout), spec_of(study).perception.see
 
     def one(params: Any, layout: Any, key: Any) -> tuple[Any, ...]:

@@ -48,6 +48,7 @@ def test_json_says_what_was_asked(told):
     assert told["warnings"] == []
 
 
+@pytest.mark.slow
 def test_one_visit_after_the_other(tmp_path, told):
     """The state that it prints can be given back; the next one is advised on likewise."""
     inventory = um.load_inventory(HARBOUR)
@@ -65,6 +66,7 @@ def test_one_visit_after_the_other(tmp_path, told):
     assert again["lifetime"]["interval"][0] > 1
 
 
+@pytest.mark.slow
 def test_tables(generalist):
     done = advise(HARBOUR, "--samples", 16)
     assert done.exit_code == 0
@@ -72,6 +74,7 @@ def test_tables(generalist):
         assert words in done.stdout
 
 
+@pytest.mark.slow
 def test_a_layout_unlike_the_training_is_warned_of_and_advised_on(tmp_path):
     text = HARBOUR.read_text().replace("capacity_j = 7", "capacity_j = 97", 1)
     (tmp_path / "big.toml").write_text(text)
@@ -101,13 +104,14 @@ def test_mistakes_are_one_line(arguments, words):
     assert len(done.stderr.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_traffic_has_a_price():
     done = advise("--place", "albany", "--price", 10, "--samples", 8, "--no-what-if", "--json")
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["next"]["name"]
 
 
-@pytest.mark.parametrize("n", [2, 12, 30])
+@pytest.mark.parametrize("n", [pytest.param(2, marks=pytest.mark.slow), 12, pytest.param(30, marks=pytest.mark.slow)])
 def test_the_shipped_policy_is_a_policy_like_any_other(generalist, n):
     params = um.Params(n_devices=n)
     layout = um.sample_layout(jax.random.key(n), params, n // 2, n // 2)
@@ -131,6 +135,7 @@ def test_it_decides_from_raw_observations(generalist):
         generalist.act(row[:-1])
 
 
+@pytest.mark.slow
 def test_it_is_far_above_oldest_first(generalist):
     """Eight towns of the middle of the grid: 15 % is two thirds of what `results/generalist` has there."""
     params = um.Params()
@@ -145,6 +150,7 @@ def test_it_is_far_above_oldest_first(generalist):
     assert own.mean() > 1.12 * oldest.mean()
 
 
+@pytest.mark.slow
 def test_a_first_failure_is_foretold(generalist):
     """The forecast of one town holds on other futures of it."""
     params, layout = um.Params(), um.sample_layout(jax.random.key(11), um.Params(), 4, 8)

@@ -87,3 +87,38 @@ def test_simulation_against_a_run(tmp_path):
     assert "wall time" in out
     report = json.loads((tmp_path / "run" / "simulation.json").read_text())
     assert set(report["measured"]) == {"wall_s", "disk_bytes", "memory_bytes"}
+
+
+def test_generalist_training(tmp_path):
+    run("generalist_training.py", "--scenarios", 8, "--epochs", 1, "--steps", 16_384, "--towns", 1, "--out", tmp_path)
+    report = json.loads((tmp_path / "training.json").read_text())
+    assert len(report["ppo"]["slots"]) == len(report["ppo"]["seconds"]) == 1
+    assert report["imitation_then_ppo"]["seconds"][0] > report["beam"]["seconds"]
+    assert report["lines"]["oldest_first"] < report["lines"]["bound"]
+    assert (tmp_path / "training.png").stat().st_size > 20_000
+
+
+def test_generalist_planners(tmp_path):
+    run("generalist_planners.py", "--towns", 1, "--widths", 2, "--out", tmp_path)
+    report = json.loads((tmp_path / "planners.json").read_text())
+    assert report["episodes"] == 25
+    assert set(report["mean_slots"]) == set(report["seconds"])
+    assert report["mean_slots"]["generalist"] > 20
+
+
+def test_generalist_elsewhere_and_speed(tmp_path):
+    out = run("generalist_elsewhere.py", "--towns", 2, "--draws", 1, "--out", tmp_path)
+    assert "48 devices" in out
+    assert "random weights" in out
+    assert (tmp_path / "traffic.png").exists()
+    run("generalist_speed.py", "--scenarios", 256, "--repetitions", 3, "--out", tmp_path)
+    rows = json.loads((tmp_path / "speed.json").read_text())["policies"]
+    assert all(row["decisions_per_second"] > 0 for row in rows.values())
+
+
+def test_ship_generalist(tmp_path):
+    out = run("ship_generalist.py", "--run", tmp_path / "run", "--into", tmp_path / "mine.npz", "--steps", 16_384)
+    assert "mine.npz" in out
+    from uavmec_jax.studies.policies import load_policy
+
+    assert load_policy(tmp_path / "mine.npz").n_devices is None

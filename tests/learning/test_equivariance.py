@@ -30,7 +30,7 @@ def permuted(order, layout, state):
     return jax.tree.map(take, layout), state.replace(battery=state.battery[order], age=state.age[order])
 
 
-@pytest.mark.parametrize("n", [2, 5, 12, 24, 64])
+@pytest.mark.parametrize("n", [*(pytest.param(n, marks=pytest.mark.slow) for n in (2, 24, 64)), 5, 12])
 def test_permuting_devices_permutes_the_logits_and_nothing_else(n):
     rng = np.random.default_rng(n)
     for seed in range(6):
@@ -42,7 +42,7 @@ def test_permuting_devices_permutes_the_logits_and_nothing_else(n):
         assert_array_equal(same, value)
 
 
-@pytest.mark.parametrize("n", [3, 12])
+@pytest.mark.parametrize("n", [pytest.param(3, marks=pytest.mark.slow), 12])
 def test_padding_changes_nothing(n):
     params, layout, state = mid_life(1, n)
     logits, value = judge(params, layout, state)
@@ -54,6 +54,7 @@ def test_padding_changes_nothing(n):
     assert_array_equal(wide[n:], np.full(4, NOT_THERE, np.float32))
 
 
+@pytest.mark.slow
 def test_padding_may_stand_anywhere():
     params, layout, state = mid_life(2, 5)
     padded = pad_layout(layout, 8)
@@ -74,6 +75,7 @@ def test_sum_does_not_depend_on_the_order():
     np.testing.assert_allclose(gradient, jnp.broadcast_to(2 * jnp.sum(x, 1, keepdims=True), x.shape), atol=0.01)
 
 
+@pytest.mark.slow
 def test_masked_actions_are_never_drawn():
     params, layout, state = mid_life(4, 3)
     padded = pad_layout(layout, 6)
@@ -83,6 +85,6 @@ def test_masked_actions_are_never_drawn():
 
 
 def test_features_are_named_once():
-    params, layout, state = mid_life(0, 4)
     names = [feature.name for feature in FEATURES]
-    assert len(set(names)) == len(names) == observe_devices(params, layout, state).features.shape[-1]
+    seen = jax.eval_shape(observe_devices, *mid_life(0, 4))
+    assert len(set(names)) == len(names) == seen.features.shape[-1]

@@ -52,8 +52,9 @@ def test_numbers_worked_out_by_hand(small):
     assert_array_equal(seen["traffic_price"], [0, 0, 0])
 
 
+@pytest.mark.slow
 def test_what_is_hoped_for_is_what_the_rule_hopes_for():
-    for seed in range(5):
+    for seed in range(2):
         params, layout, state = mid_life(seed, 12)
         charged = demand.shares(layout, demand.coverage(params, layout))
         slots, services = deadlines.hoped_for(params, layout, state, demand.mean_slot(params, layout), charged)
@@ -72,6 +73,7 @@ def test_data_that_cannot_be_fetched_in_time_are_seen():
     assert features(params, layout, fine)["can_wait"].min() == 1
 
 
+@pytest.mark.slow
 def test_traffic_shows_at_its_price():
     params, layout, state = mid_life(0, 5)
     weight = jnp.array([[0.0, 0.25, 0.5, 0.75, 1.0], [1.0, 0.0, 0.0, 0.0, 0.0]])
@@ -93,6 +95,7 @@ def test_entries_that_are_no_devices_show_nothing():
     assert whole.mask.all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [2, 12, 64])
 def test_all_features_are_finite_and_moderate(n):
     for seed in range(3):

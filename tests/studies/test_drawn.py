@@ -82,13 +82,17 @@ def test_a_study_reads_back_to_itself():
             "devices = [2, 7]",
             "scenarios.devices is [2.0, 7.0]; give [low, high] with 2 <= low <= high <= 6",
         ),
-        ("devices = [2, 6]", "powered = [0.5, 1.2]", "scenarios.powered is [0.5, 1.2]; give [low, high] with 0 <= low"),
         (
             "devices = [2, 6]",
-            "region_m = [0.0, 9.0]",
+            "devices = [2, 6]\npowered = [0.5, 1.2]",
+            "scenarios.powered is [0.5, 1.2]; give [low, high] with 0 <= low",
+        ),
+        (
+            "devices = [2, 6]",
+            "devices = [2, 6]\nregion_m = [0.0, 9.0]",
             "scenarios.region_m is [0.0, 9.0]; give [low, high] with 0 < low",
         ),
-        ("devices = [2, 6]", "uav_factor = [2.0, 1.0]", "scenarios.uav_factor is [2.0, 1.0]"),
+        ("devices = [2, 6]", "devices = [2, 6]\nuav_factor = [2.0, 1.0]", "scenarios.uav_factor is [2.0, 1.0]"),
         ("typical_least = 2", "typical_least = 9", "scenarios.typical_least is 9; typical_devices is the most"),
         ("typical_least = 2", "typical = 1.5", "scenarios.typical is 1.5"),
         ("typical_least = 2", "devises = 1", "did you mean 'devices'?"),
@@ -113,6 +117,7 @@ def test_what_does_not_fit_is_one_line(old, new, words):
     assert "\n" not in str(told.value)
 
 
+@pytest.mark.slow
 def test_an_episode_that_ends_is_followed_by_one_in_a_fresh_scenario():
     """Where an episode ended the town is another one, the others go on in theirs."""
     study = study_of()
@@ -144,6 +149,7 @@ def run(tmp_path_factory):
     return run_study(study_of(), folder), folder
 
 
+@pytest.mark.slow
 def test_a_run_is_judged_and_read_back(run):
     results, _ = run
     assert results.run["complete"]
@@ -155,6 +161,7 @@ def test_a_run_is_judged_and_read_back(run):
     assert results.cells()["seeds"].tolist() == [2]
 
 
+@pytest.mark.slow
 def test_its_policies_play_any_number_of_devices(run):
     _, folder = run
     with pytest.raises(PolicyError, match="they differ in seed"):
@@ -180,6 +187,7 @@ def test_what_is_unlike_the_training_is_named():
     assert found[-1] == "data_age_limit_slots: 20; it was trained on 10"
 
 
+@pytest.mark.slow
 def test_the_paper_s_observation_learns_on_drawn_scenarios_too():
     """Nothing ties drawn scenarios to the full observation: a network of the paper's words takes layouts of one size."""
     study = study_of(TOML.replace('observation = "full"', 'observation = "paper"'), **{"axes.seeds": 1})

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from uavmec_jax.planning.heuristics import HEURISTICS
@@ -32,6 +33,7 @@ def test_nobody_has_the_rest():
     assert_allclose(with_nobody(np.array([[0.25, 0.25], [0.5, 0.5]])), [[0.25, 0.25, 0.5], [0.5, 0.5, 0.0]])
 
 
+@pytest.mark.slow
 def test_probabilities_of_two_towns():
     params = Params(n_devices=4)
     keys = jax.random.split(jax.random.key(0), 2)

@@ -87,6 +87,7 @@ def test_too_many_devices_are_not_padded():
         pad_layout(sample_layout(jax.random.key(0), Params(), 4, 4), 8)
 
 
+@pytest.mark.slow
 def test_draws_are_played_in_their_own_scenarios():
     distribution = ScenarioDistribution(PARAMS, make_reward({}))
     keys = jax.random.split(jax.random.key(3), 4)
@@ -99,6 +100,7 @@ def test_draws_are_played_in_their_own_scenarios():
     assert_array_equal(play_draws(rule, fixed, keys).length, rollouts(rule, fixed.params, fixed.layout, keys).length)
 
 
+@pytest.mark.slow
 def test_the_reward_of_a_life_is_its_length():
     from uavmec_jax.world.rollout import returns
 

@@ -202,6 +202,7 @@ def test_seeds_differ_and_repeat(seed):
     assert (layout_of(seed).position != layout_of(seed + 1).position).any()
 
 
+@pytest.mark.slow
 def test_another_way_to_see():
     """The environment with the full observation plays the same slots, and tells the true last observation likewise."""
     scenario = make_scenario()

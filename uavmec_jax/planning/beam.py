@@ -82,14 +82,14 @@ def horizon(params: Params, layouts: Layout) -> int:
         params: leaves ``[B]``.
         layouts: leaves ``[B, n]``.
     """
-    needed = int(jnp.max(_longest(params, layouts)))
+    needed = int(jnp.max(longest(params, layouts)))
     return max(64, 1 << (needed - 1).bit_length())
 
 
 @jax.jit
 @jax.vmap
-def _longest(params: Params, layout: Layout) -> Int[Array, ""]:
-    """Slots that the UAV's battery can pay for if every slot is as short as can be."""
+def longest(params: Params, layout: Layout) -> Int[Array, ""]:
+    """Slots ``[B]`` that the UAV's battery can pay for if every slot is as short as can be; leaves ``[B]``, ``[B, n]``."""
     least = jnp.full((1, layout.capacity.shape[0]), params.task_volume_range_bytes[0], jnp.float32)
     shortest = jnp.min(demand.slot_costs(params, layout, least).duration)
     base, _ = demand.flight_power(params)

@@ -79,7 +79,7 @@ def _failures(advice: Advice, names: Sequence[str]) -> Table:
     table = Table()
     for name in ("device", "probability", "in slot"):
         table.add_column(name, justify="left" if name == "device" else "right")
-    for device in np.argsort(-advice.first_failure, kind="stable")[:SHOWN]:
+    for device in np.argsort(-advice.first_failure, kind="stable")[:SHOWN].tolist():
         if advice.first_failure[device] > 0:
             slot = f"{advice.failure_slot[device]:.1f}"
             table.add_row(called(device + 1, names[device]), f"{advice.first_failure[device]:.0%}", slot)

@@ -71,8 +71,9 @@ def load_scenario(
     keys = held_out_draws(seed, powered, connected, draws)
     if evacuation is None:
         return inventory_of(layout, params, name), keys
-    name = f"{evacuation.name}, {name}"
-    return inventory_of(on_place(layout, evacuation), params, name, evacuation.meta["names"]), keys
+    there = on_place(layout, evacuation)
+    inventory = inventory_of(there, params, f"{evacuation.name}, {name}", evacuation.meta["names"])
+    return replace(inventory, layout=replace(inventory.layout, traffic=there.traffic)), keys
 
 
 def _params(settings: dict[str, Any]) -> Params:

@@ -4,7 +4,7 @@ import dataclasses
 import difflib
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field, create_model
@@ -90,6 +90,7 @@ def one_line(source: str, error: pydantic.ValidationError, root: type[BaseModel]
         parent: Any = root
         for part in first["loc"][:-1]:
             parent = parent.model_fields[part].annotation if part in getattr(parent, "model_fields", {}) else None
+            parent = next((one for one in get_args(parent) if hasattr(one, "model_fields")), parent)  # X | None
         known = getattr(parent, "model_fields", {})
         hint = nearest(str(first["loc"][-1]), known)
         everything = "" if parent is root or hint.startswith("known") else f" known: {', '.join(known)}"
