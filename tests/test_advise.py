@@ -125,6 +125,7 @@ def test_the_shipped_policy_is_a_policy_like_any_other(generalist, n):
     assert generalist.appraise(params, layout, states).shape == (2,)
 
 
+@pytest.mark.slow
 def test_it_decides_from_raw_observations(generalist):
     params, layout = um.Params(), um.sample_layout(jax.random.key(1), um.Params(), 8, 8)
     state = um.initial_state(params, layout)

@@ -70,6 +70,7 @@ def test_first_gradient_step_falls_at_step_104():
     assert all(moved)
 
 
+@pytest.mark.slow
 def test_target_is_copied_before_the_gradient_step():
     agents = stack([make_agent(0, target_interval=200)])
     at_196 = train(SPEC, agents, 0, 49)

@@ -42,6 +42,7 @@ def test_permuting_devices_permutes_the_logits_and_nothing_else(n):
         assert_array_equal(same, value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [pytest.param(3, marks=pytest.mark.slow), 12])
 def test_padding_changes_nothing(n):
     params, layout, state = mid_life(1, n)

@@ -69,6 +69,7 @@ def test_a_rollout_plays_the_environment():
     assert (lengths[:-1] > 5).all()
 
 
+@pytest.mark.slow
 def test_a_cut_off_episode_is_bootstrapped():
     """With a time limit of one slot every reward holds the discounted value of the state that was cut off."""
     spec = a2c.A2CSpec(n_steps=4)
@@ -101,6 +102,7 @@ def test_an_agent_is_itself_whoever_trains_beside_it(name):
 
 
 @pytest.mark.parametrize("name", BOTH)
+@pytest.mark.slow
 @pytest.mark.parametrize("bad", [{"learning_rate": np.inf}, {"gamma": np.nan}])
 def test_diverged_agent_is_frozen_marked_and_touches_nobody(name, bad):
     state = train(name, population(name, {}, bad, {}), 0, 12)

@@ -65,6 +65,7 @@ def test_what_a_repair_brings(scene, advice):
     assert {one.change for one in advice.what_if} == set(CHANGES)
 
 
+@pytest.mark.slow
 def test_the_policys_own_choice_is_kept_where_nothing_is_better():
     """With power and communication everywhere no visit of a device that is near is better than another."""
     params, layout, _ = mid_life(0, 3)
@@ -74,6 +75,7 @@ def test_the_policys_own_choice_is_kept_where_nothing_is_better():
     assert advice.first_failure.sum() == 0
 
 
+@pytest.mark.slow
 def test_forecasts_are_those_of_independent_futures(scene):
     """Probabilities from other futures agree within what 4 standard errors allow."""
     params, layout, _ = scene
@@ -91,6 +93,7 @@ def test_forecasts_are_those_of_independent_futures(scene):
     assert abs(np.asarray(played.length).mean() - advice.lifetimes.mean()) < error
 
 
+@pytest.mark.slow
 def test_same_key_same_advice(scene):
     params, layout, state = scene
     again = [advise(RULE, params, layout, state, key=jax.random.key(k), samples=32) for k in (3, 3, 4)]

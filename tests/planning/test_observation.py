@@ -63,6 +63,7 @@ def test_what_is_hoped_for_is_what_the_rule_hopes_for():
         assert_allclose(seen["services"], services / slots, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_data_that_cannot_be_fetched_in_time_are_seen():
     params, layout, state = mid_life(3, 12)
     lost = state.replace(age=jnp.where(layout.has_comms, 0, 10))
@@ -85,6 +86,7 @@ def test_traffic_shows_at_its_price():
     assert_array_equal(free["traffic_price"], 0)
 
 
+@pytest.mark.slow
 def test_entries_that_are_no_devices_show_nothing():
     params, layout, state = mid_life(1, 4)
     more = state.replace(battery=jnp.append(state.battery, 1.0), age=jnp.append(state.age, 0))

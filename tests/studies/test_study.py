@@ -36,7 +36,7 @@ def test_shipped_studies_are_valid_and_round_trip(name):
     study = load_study(name)
     assert study.name == name
     assert parse_study(study_toml(study), "again") == study
-    sizes = {"planning": 2500, "table6": 675, "table7": 240, "table7-ppo": 120}
+    sizes = {"planning": 2500, "table6": 675, "table7": 240, "table7-ppo": 120, "generalist": 2}
     assert n_agents(study) == len(identities(study)) == sizes.get(name, 250)
 
 

@@ -63,8 +63,11 @@ def test_other_scenarios_fill_their_ranges():
     assert np.isclose(np.asarray(drawn.layout.traffic.weight), 0.3).mean() > 0.15
 
 
+_MORE = ("oldest-first", "earliest-deadline", "random", "lowest-battery")
+
+
 @pytest.mark.parametrize(
-    "name", ["oldest-first", "round-robin", "shortest-tour", "earliest-deadline", "random", "lowest-battery"]
+    "name", ["round-robin", "shortest-tour", *(pytest.param(name, marks=pytest.mark.slow) for name in _MORE)]
 )
 def test_rules_do_not_notice_padding(name):
     """A layout with entries that are no devices lives as long as without; random draws are others."""

@@ -52,7 +52,9 @@ def on_place(
         scale_to_m: see :meth:`Evacuation.local_position`.
     """
     traffic = Traffic(
-        weight=jnp.asarray(_weights(evacuation, moving)), window_s=jnp.float32(evacuation.meta["window_s"])
+        weight=jnp.asarray(_weights(evacuation, moving)),
+        window_s=jnp.float32(evacuation.meta["window_s"]),
+        price=jnp.float32(0),
     )
     position = jnp.asarray(evacuation.local_position(scale_to_m), jnp.float32)
     return replace(layout, position=position, traffic=traffic)
@@ -74,6 +76,7 @@ def onto_places(layouts: Layout, agents: Sequence[Mapping[str, Any]], study: Stu
     traffic = Traffic(
         weight=jnp.asarray(np.stack(padded)),
         window_s=jnp.asarray([evacuation.meta["window_s"] for evacuation in own], jnp.float32),
+        price=jnp.zeros(len(own)),
     )
     position = np.stack([evacuation.local_position(study.place_scale_m) for evacuation in own])
     return replace(layouts, position=jnp.asarray(position, jnp.float32), traffic=traffic)
