@@ -81,11 +81,13 @@ def training_figure(curve: Mapping[str, Any], path: Path) -> None:
     axis.plot(curve["ppo"]["seconds"], curve["ppo"]["slots"], "o-", label="generalist, once for all towns")
     if "dqn" in curve:
         axis.plot(curve["dqn"]["seconds"], curve["dqn"]["slots"], "s--", label="the paper's DQN, for each town again")
-    for name, slots in curve["lines"].items():
+    for number, (name, slots) in enumerate(curve["lines"].items()):
         axis.axhline(slots, color="0.6", linewidth=0.8)
-        axis.annotate(
-            spoken(name), (1.0, slots), xycoords=("axes fraction", "data"), fontsize=8, ha="right", va="bottom"
-        )
+        where = {
+            "xycoords": ("axes fraction", "data"),
+            "va": "top" if number % 2 else "bottom",
+        }  # neighbours may be near
+        axis.annotate(spoken(name), (0.01, slots), fontsize=8, **where)
     axis.axvline(PAPER_TRAINING_S, color="tab:red", linewidth=1, linestyle=":")
     axis.annotate(
         "the paper's 11 minutes",
@@ -99,7 +101,7 @@ def training_figure(curve: Mapping[str, Any], path: Path) -> None:
     axis.set_xscale("log")
     axis.set_xlabel("seconds of training on this machine")
     axis.set_ylabel("mean lifetime over the grid, slots")
-    axis.legend(frameon=False, loc="lower right", bbox_to_anchor=(1.0, 0.08))
+    axis.legend(frameon=False, loc="center", bbox_to_anchor=(0.55, 0.5))
     save(figure, path)
 
 
