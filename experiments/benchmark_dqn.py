@@ -134,6 +134,7 @@ def sb3_speed(processes: int, seconds: float) -> tuple[float, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=10.0, help="length of each measurement")
+    parser.add_argument("--agents", type=int, nargs="+", default=AGENTS, help="sizes of the populations")
     parser.add_argument("--out", type=Path, help="folder for benchmark_dqn.json")
     parser.add_argument("--sb3-worker", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -160,7 +161,7 @@ def main() -> None:
     cores = facts["cores"]
     report["sb3_processes"] = cores
     report["sb3_all_processes"], _ = sb3_speed(cores, arguments.seconds) if has_sb3 else missing
-    report["training"] = [train_speed(n, arguments.seconds) for n in AGENTS]
+    report["training"] = [train_speed(n, arguments.seconds) for n in arguments.agents]
     report["ceiling"] = ceiling(AGENTS_PER_CORE - 2, arguments.seconds)
     report["environment"] = {n: environment_speed(n, arguments.seconds) for n in (75, 4096)}
 

@@ -78,17 +78,19 @@ def main() -> None:
     parser.add_argument("--policy", default="generalist")
     parser.add_argument("--towns", type=int, default=100)
     parser.add_argument("--draws", type=int, default=4)
+    parser.add_argument("--only", nargs="+", help="these kinds of scenarios, and their traffic, and random weights")
     parser.add_argument("--out", type=Path, default=Path("results/generalist"))
     arguments = parser.parse_args()
 
     policy = load_policy(arguments.policy)
+    chosen = {name: kind for name, kind in kinds().items() if name in (arguments.only or kinds())}
     elsewhere = pd.DataFrame(
-        [row(name, *kind, policy, arguments.towns, arguments.draws) for name, kind in kinds().items()]
+        [row(name, *kind, policy, arguments.towns, arguments.draws) for name, kind in chosen.items()]
     )
     traffic = pd.DataFrame(
         [
             one
-            for name, (params, layouts) in traffic_scenes(arguments.towns).items()
+            for name, (params, layouts) in traffic_scenes(chosen, arguments.towns).items()
             for one in prices(name, params, layouts, policy, arguments.draws)
         ]
     )
@@ -126,9 +128,9 @@ def row(name: str, params: Params, place: str | None, policy: Any, count: int, d
     return found
 
 
-def traffic_scenes(count: int) -> dict[str, tuple[Params, Layout]]:
-    """The two places, and towns with random weights."""
-    found = {place: (params, towns(params, place, count)) for params, place in kinds().values() if place}
+def traffic_scenes(chosen: dict[str, tuple[Params, str | None]], count: int) -> dict[str, tuple[Params, Layout]]:
+    """The places, and towns with random weights."""
+    found = {place: (params, towns(params, place, count)) for params, place in chosen.values() if place}
     params = Params()
     layouts = towns(params, None, count)
     weight = jax.random.uniform(jax.random.key(_TOWNS + 2), (count, 1, params.n_devices)) ** 2

@@ -34,7 +34,7 @@ def main() -> None:
     policy = load_policy(arguments.run, "best", seed=int(best["seed"]))
     assert isinstance(policy, TrainedPolicy)
     policy.save(arguments.into)
-    table = results.agents[["seed", "best_step", "best_validation", "best_lifetime", "earliest_deadline_lifetime"]]
+    table = results.agents[["seed", "best_step", "best_validation", "best_lifetime", "oldest_first_lifetime"]]
     print(table.to_string(index=False))
     print(f"seed {best['seed']} -> {arguments.into}, {arguments.into.stat().st_size:,} bytes; {results.run['seconds']}")
 

@@ -48,7 +48,7 @@ def test_help_does_not_import_jax():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert "run table5 --quick" in done.stdout
     assert done.stdout.strip().endswith("False")
-    for command in ("run", "plan", "evaluate", "show", "compare", "validate", "doctor"):
+    for command in ("run", "advise", "plan", "evaluate", "show", "compare", "validate", "doctor"):
         assert "Usage" in CliRunner().invoke(main, [command, "--help"]).stdout
 
 

@@ -80,6 +80,7 @@ def test_target_is_copied_before_the_gradient_step():
     assert any((a != b).any() for a, b in zip(*map(jax.tree.leaves, (at_200.target, at_200.weights)), strict=True))
 
 
+@pytest.mark.slow
 def test_warm_up_explores_uniformly():
     agents = stack([make_agent(0, learning_starts=20_000, exploration_initial_eps=0.0, exploration_final_eps=0.0)])
     state = train(SPEC, agents, 0, 5_000)

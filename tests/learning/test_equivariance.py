@@ -8,7 +8,7 @@ from numpy.testing import assert_array_equal
 
 from tests.worlds import mid_life
 from uavmec_jax.learning import ppo
-from uavmec_jax.learning.networks import NOT_THERE, sum_in_any_order
+from uavmec_jax.learning.networks import NOT_THERE, sum_over_devices
 from uavmec_jax.learning.perception import PERCEPTIONS
 from uavmec_jax.planning.observation import FEATURES, observe_devices
 from uavmec_jax.world.layout import pad_layout
@@ -69,10 +69,10 @@ def test_padding_may_stand_anywhere():
 def test_sum_does_not_depend_on_the_order():
     x = jax.random.normal(jax.random.key(0), (3, 64, 5)) * 10.0
     order = np.random.default_rng(1).permutation(64)
-    found = sum_in_any_order(x)
-    assert_array_equal(found, sum_in_any_order(x[:, order]))
+    found = sum_over_devices(x)
+    assert_array_equal(found, sum_over_devices(x[:, order]))
     np.testing.assert_allclose(found, jnp.sum(x, axis=1), atol=64 * 2.0**-16)
-    gradient = jax.grad(lambda x: jnp.sum(sum_in_any_order(x) ** 2))(x)
+    gradient = jax.grad(lambda x: jnp.sum(sum_over_devices(x) ** 2))(x)
     np.testing.assert_allclose(gradient, jnp.broadcast_to(2 * jnp.sum(x, 1, keepdims=True), x.shape), atol=0.01)
 
 

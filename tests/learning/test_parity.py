@@ -168,6 +168,7 @@ def test_epsilon():
     assert_allclose(ours, theirs["epsilon"], rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "layers"), [("dqn", DQN_LAYERS), ("ppo", ACTOR_CRITIC_LAYERS)])
 def test_initial_weights_come_from_the_same_distribution(name, layers):
     theirs = golden("initial")

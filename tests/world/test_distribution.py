@@ -42,6 +42,7 @@ def test_typical_scenarios_have_the_papers_numbers():
     assert_array_equal(drawn.layout.traffic.price, 0)
 
 
+@pytest.mark.slow
 def test_other_scenarios_fill_their_ranges():
     drawn = draw(typical=0.0, traffic=1.0, traffic_weights=jnp.array([0.3, 1.0]))
     present = np.asarray(drawn.layout.present)

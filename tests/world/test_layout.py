@@ -46,6 +46,7 @@ def test_sampled_layout_has_the_counts_and_ranges(n):
     assert set(np.unique(layouts.task)) == set(range(5))
 
 
+@pytest.mark.slow
 def test_masks_are_uniform_and_independent():
     layouts = jax.vmap(lambda key: sample_layout(key, Params(), 4, 8))(jax.random.split(jax.random.key(1), 20_000))
     power, comms = np.asarray(layouts.has_power), np.asarray(layouts.has_comms)

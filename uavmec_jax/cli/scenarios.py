@@ -96,7 +96,7 @@ def evaluate(
     save: Path | None,
     as_json: bool,
 ) -> None:
-    """Judge POLICY on one scenario: a policy file, the folder of a run, or a name (oldest-first, rollout, ...).
+    """Judge POLICY on one scenario: a policy file, the folder of a run, or a name (generalist, oldest-first, rollout, ...).
 
     Of a run it is by default the agent that learned in the town asked for.
     """
@@ -104,13 +104,13 @@ def evaluate(
     from rich.console import Console
 
     from uavmec_jax.reporting.compare import evaluation_table
-    from uavmec_jax.studies.policies import TrainedPolicy, load_policy
+    from uavmec_jax.studies.policies import TrainedPolicy, draws_scenarios, load_policy
     from uavmec_jax.studies.scenario import evaluate as judge
     from uavmec_jax.studies.scenario import load_scenario
 
     axes = dict(assignment(setting, "--agent") for setting in agent)
     here = town | {"seed": seed} | ({"place": place} if place else {})
-    if Path(policy).is_dir() and scenario is None:
+    if Path(policy).is_dir() and scenario is None and not draws_scenarios(Path(policy)):
         axes = here | axes
     chosen = load_policy(policy, weights, **axes)
     inventory, keys = load_scenario(
@@ -142,7 +142,12 @@ def evaluate(
     if trained is not None:
         known = ", ".join(f"{name} {value}" for name, value in trained.trained_on.items())
         console.print(f"Trained by {trained.algorithm.upper()} on {known}.", highlight=False)
-        if scenario is not None or any(trained.trained_on.get(name) != here.get(name) for name in (*here, "place")):
+        for line in trained.unlike_training(inventory.params, inventory.layout):
+            console.print(f"Unlike its training: {line}.", highlight=False)
+        one_town = trained.n_devices is not None
+        if one_town and (
+            scenario is not None or any(trained.trained_on.get(name) != here.get(name) for name in (*here, "place"))
+        ):
             console.print(
                 "This is another town: its observation names no places, so nothing it learned need hold here."
             )

@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from uavmec_jax.world.exact import sum_in_any_order
+
 
 @jax.custom_vjp
 def matmul(x: Float[Array, "... i"], w: Float[Array, "i o"]) -> Float[Array, "... o"]:
@@ -165,18 +167,14 @@ def scale_ages(observation: Float[Array, "*b two_n"], age_scale: Any) -> Float[A
 
 
 @jax.custom_jvp
-def sum_in_any_order(x: Float[Array, "*b n f"]) -> Float[Array, "*b f"]:
-    """Sum over the devices that does not depend on their order, to the bit: in fixed point, steps of 2**-16.
-
-    Terms beyond +-400 are cut, so that 64 of them fit. The gradient is that of a plain sum.
-    """
-    fixed = jnp.round(jnp.clip(x, -400.0, 400.0) * 65536.0).astype(jnp.int32)
-    return jnp.sum(fixed, axis=-2).astype(jnp.float32) / 65536.0
+def sum_over_devices(x: Float[Array, "b n f"]) -> Float[Array, "b f"]:
+    """:func:`sum_in_any_order` over the devices, with the gradient of a plain sum."""
+    return sum_in_any_order(x, axis=-2)
 
 
-@sum_in_any_order.defjvp
+@sum_over_devices.defjvp
 def _sum_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    return sum_in_any_order(*primals), jnp.sum(tangents[0], axis=-2)
+    return sum_over_devices(*primals), jnp.sum(tangents[0], axis=-2)
 
 
 class Score(nn.Module):
@@ -229,7 +227,7 @@ class EquivariantActorCritic(nn.Module):
         x = x.reshape(*mask.shape, -1)
         shown = jnp.where(mask[..., None], x, 0.0)  # what relu leaves is not negative, so 0 never wins over a device
         count = jnp.maximum(jnp.sum(mask, axis=-1, keepdims=True), 1)
-        return x, jnp.concatenate([sum_in_any_order(shown) / count, jnp.max(shown, axis=-2)], axis=-1), mask
+        return x, jnp.concatenate([sum_over_devices(shown) / count, jnp.max(shown, axis=-2)], axis=-1), mask
 
     def _logits(self, x: Array, pooled: Array, mask: Array) -> Float[Array, "b n"]:
         own = self.own(x.reshape(-1, x.shape[-1])).reshape(x.shape)

@@ -13,6 +13,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from uavmec_jax.planning import deadlines, demand
+from uavmec_jax.world.exact import sum_in_any_order
 from uavmec_jax.world.layout import Layout
 from uavmec_jax.world.params import Params
 from uavmec_jax.world.physics import State, slots_to_expiry
@@ -78,12 +79,6 @@ class Observation:
 
     features: Any
     mask: Any
-
-
-def sum_exactly(x: Float[Array, "*b n"], axis: int = -1) -> Float[Array, "*b"]:
-    """A sum that does not depend on the order of its terms, to the bit: in fixed point, steps of 2**-16, up to 2**15."""
-    steps = jnp.round(jnp.clip(x, -500.0, 500.0) * 65536.0).astype(jnp.int32)
-    return jnp.sum(steps, axis=axis).astype(jnp.float32) / 65536.0
 
 
 def observe_devices(params: Params, layout: Layout, state: State) -> Observation:
@@ -204,7 +199,7 @@ def _after(params: Params, layout: Layout, state: State, known: _Known, slots: A
     missing = (left * known.drain - battery) / saving
     services = jnp.where(layout.has_power, 0.0, jnp.maximum(missing, 0.0))
     turns, _ = demand.age_visits(params, layout, age, left)
-    spare = left - sum_exactly(jnp.maximum(services, turns) * known.charged)
+    spare = left - sum_in_any_order(jnp.maximum(services, turns) * known.charged)
     due = _due(params, layout, age)
     load = demand.load_by_due(due, known.charged)
     tight = jnp.max(jnp.where(due < demand.NEVER, load - due, -2.0 * 64), axis=-1)
@@ -218,7 +213,7 @@ def _globals(
     base, _ = demand.flight_power(params)
     uav_slots = state.uav_energy / jnp.maximum(base * jnp.min(known.mean.duration), 1e-3)
     fresh, _ = demand.age_visits(params, layout, state.age, slots)
-    needed = sum_exactly(jnp.maximum(services, fresh) * known.charged)
+    needed = sum_in_any_order(jnp.maximum(services, fresh) * known.charged)
     due = _due(params, layout, state.age)
     falls_due = due <= slots
     load = demand.load_by_due(jnp.where(falls_due, due, demand.NEVER), known.charged)

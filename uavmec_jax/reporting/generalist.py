@@ -83,11 +83,8 @@ def training_figure(curve: Mapping[str, Any], path: Path) -> None:
         axis.plot(curve["dqn"]["seconds"], curve["dqn"]["slots"], "s--", label="the paper's DQN, for each town again")
     for number, (name, slots) in enumerate(curve["lines"].items()):
         axis.axhline(slots, color="0.6", linewidth=0.8)
-        where = {
-            "xycoords": ("axes fraction", "data"),
-            "va": "top" if number % 2 else "bottom",
-        }  # neighbours may be near
-        axis.annotate(spoken(name), (0.01, slots), fontsize=8, **where)
+        side = "top" if number % 2 else "bottom"  # neighbours may be near
+        axis.annotate(spoken(name), (0.01, slots), xycoords=("axes fraction", "data"), fontsize=8, va=side)
     axis.axvline(PAPER_TRAINING_S, color="tab:red", linewidth=1, linestyle=":")
     axis.annotate(
         "the paper's 11 minutes",

@@ -144,7 +144,9 @@ def list_table(results: Results, cells: pd.DataFrame) -> Table:
         table.add_column(policy.replace("_", "-"), justify="right")
     for upper, lower in results.gaps:
         table.add_column(f"{lower.replace('_', '-')} to {upper}, %", justify="right")
-    table.add_column("first to fail", justify="right")
+    drawn = results.study.scenarios is not None  # every draw is another town: numbers of devices mean nothing
+    if not drawn:
+        table.add_column("first to fail", justify="right")
     for _, cell in cells.iterrows():
         lifetimes = []
         for policy in results.policies:
@@ -153,9 +155,8 @@ def list_table(results: Results, cells: pd.DataFrame) -> Table:
             )
             lifetimes.append(f"{cell[policy]:.1f}{interval}")
         gaps = [f"{gap:+.1f}" for gap in gap_percent(results, cell).values()]
-        table.add_row(
-            *place(cell, (*axes, "seeds")), *lifetimes, *gaps, first_to_fail(cell[f"{results.shown}_first_device"])
-        )
+        failing = [] if drawn else [first_to_fail(cell[f"{results.shown}_first_device"])]
+        table.add_row(*place(cell, (*axes, "seeds")), *lifetimes, *gaps, *failing)
     return table
 
 

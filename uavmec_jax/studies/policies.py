@@ -155,3 +155,12 @@ def load_policy(source: str | Path, which: str = "best", **axes: Any) -> Policy:
         return TrainedPolicy.of(collection, name, place, next(iter(kinds)) if len(kinds) == 1 else which)
     except PolicyError as error:
         raise PolicyError(f"{path}: {error}") from None
+
+
+def draws_scenarios(directory: Path) -> bool:
+    """Whether the agents of a run played scenarios drawn afresh, so that none belongs to a town.
+
+    Raises:
+        PolicyError: the folder holds no policies, or they are damaged.
+    """
+    return bool(read_collection(directory / WEIGHTS).drawn)

@@ -1,0 +1,49 @@
+"""The scripts about the generalist run from the clone, small."""
+
+import json
+
+import pytest
+
+from tests.experiments.scripts import run
+from tests.studies.test_drawn import TOML
+from uavmec_jax.studies.policies import load_policy
+from uavmec_jax.studies.run import run_study
+from uavmec_jax.studies.study import parse_study
+
+pytestmark = pytest.mark.slow
+
+
+def test_generalist_training(tmp_path):
+    run("generalist_training.py", "--scenarios", 8, "--epochs", 1, "--steps", 16_384, "--towns", 1, "--out", tmp_path)
+    report = json.loads((tmp_path / "training.json").read_text())
+    assert len(report["ppo"]["slots"]) == len(report["ppo"]["seconds"]) == 1
+    assert report["imitation_then_ppo"]["seconds"][0] > report["beam"]["seconds"]
+    assert report["lines"]["oldest_first"] < report["lines"]["bound"]
+    assert (tmp_path / "training.png").stat().st_size > 20_000
+
+
+def test_generalist_planners(tmp_path):
+    run("generalist_planners.py", "--towns", 1, "--widths", 2, "--out", tmp_path)
+    report = json.loads((tmp_path / "planners.json").read_text())
+    assert report["episodes"] == 25
+    assert set(report["mean_slots"]) == set(report["seconds"])
+    assert report["mean_slots"]["generalist"] > 20
+
+
+def test_generalist_elsewhere_and_speed(tmp_path):
+    few = ("--towns", 2, "--draws", 1, "--only", "6 devices", "round_lake")
+    out = run("generalist_elsewhere.py", *few, "--out", tmp_path)
+    assert "6 devices" in out
+    assert "random weights" in out
+    assert (tmp_path / "traffic.png").exists()
+    run("generalist_speed.py", "--scenarios", 256, "--repetitions", 3, "--out", tmp_path)
+    rows = json.loads((tmp_path / "speed.json").read_text())["policies"]
+    assert all(row["decisions_per_second"] > 0 for row in rows.values())
+
+
+def test_ship_generalist(tmp_path):
+    """A run that is there is not trained again: here a tiny one, of another study."""
+    run_study(parse_study(TOML, "tiny.toml"), tmp_path / "run")
+    out = run("ship_generalist.py", "--run", tmp_path / "run", "--into", tmp_path / "mine.npz")
+    assert "mine.npz" in out
+    assert load_policy(tmp_path / "mine.npz").n_devices is None
