@@ -4,11 +4,11 @@ import os
 import tempfile
 
 # The same program is compiled once in a session, whichever worker, test or subprocess asks for it: the first process
-# makes the folder, the others inherit its name.
-if "PYTEST_XDIST_WORKER" not in os.environ:
+# makes the folder, the others inherit its name. Who runs several sessions may give one folder to all of them.
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     _cache = tempfile.TemporaryDirectory(prefix="uavmec-jax-tests-")
     os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache.name
-    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
 
 import jax
 from jaxtyping import install_import_hook

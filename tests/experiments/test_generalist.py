@@ -5,10 +5,6 @@ import json
 import pytest
 
 from tests.experiments.scripts import run
-from tests.studies.test_drawn import TOML
-from uavmec_jax.studies.policies import load_policy
-from uavmec_jax.studies.run import run_study
-from uavmec_jax.studies.study import parse_study
 
 pytestmark = pytest.mark.slow
 
@@ -39,11 +35,3 @@ def test_generalist_elsewhere_and_speed(tmp_path):
     run("generalist_speed.py", "--scenarios", 256, "--repetitions", 3, "--out", tmp_path)
     rows = json.loads((tmp_path / "speed.json").read_text())["policies"]
     assert all(row["decisions_per_second"] > 0 for row in rows.values())
-
-
-def test_ship_generalist(tmp_path):
-    """A run that is there is not trained again: here a tiny one, of another study."""
-    run_study(parse_study(TOML, "tiny.toml"), tmp_path / "run")
-    out = run("ship_generalist.py", "--run", tmp_path / "run", "--into", tmp_path / "mine.npz")
-    assert "mine.npz" in out
-    assert load_policy(tmp_path / "mine.npz").n_devices is None

@@ -10,6 +10,7 @@ from tests.worlds import mid_life
 from uavmec_jax.planning.advice import advise
 from uavmec_jax.planning.changes import CHANGES
 from uavmec_jax.planning.heuristics import HEURISTICS
+from uavmec_jax.world.layout import Traffic
 from uavmec_jax.world.physics import initial_state
 from uavmec_jax.world.rollout import rollouts
 
@@ -100,3 +101,17 @@ def test_same_key_same_advice(scene):
     assert_array_equal(again[0].lifetimes, again[1].lifetimes)
     start = advise(RULE, params, layout, initial_state(params, layout), samples=32)
     assert_array_equal(start.lifetimes, advise(RULE, params, layout, samples=32).lifetimes)
+
+
+@pytest.mark.slow
+def test_a_price_is_part_of_what_a_visit_is_worth(scene):
+    """Whoever must not fail first is worth a detour: the advice earns at least what it does without looking at the price."""
+    params, layout, state = scene
+    free = advise(RULE, params, layout, state, samples=SAMPLES)
+    weight = jnp.asarray(free.first_failure, jnp.float32)[None]
+    priced = layout.replace(traffic=Traffic(weight, jnp.float32(jnp.inf), jnp.float32(50.0)))
+    spared = advise(RULE, params, priced, state, samples=SAMPLES)
+    cost = 50.0 * np.asarray(weight[0])
+    earned = [one.lifetimes.mean() - one.first_failure @ cost for one in (free, spared)]
+    assert earned[1] >= earned[0] - 1e-3
+    assert all(one.behind >= -1e-3 for one in spared.candidates)

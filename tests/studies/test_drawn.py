@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from tests.experiments.scripts import run as run_script
 from tests.learning.agents import take
 from uavmec_jax.errors import PolicyError, StudyError
 from uavmec_jax.learning import experience, on_policy, ppo
@@ -185,3 +186,14 @@ def test_what_is_unlike_the_training_is_named():
     assert named == ["devices", "extent in m", "the UAV's speed in m/s", "data_age_limit_slots"]
     assert found[0] == "devices: 40; it was trained on 4 to 16"
     assert found[-1] == "data_age_limit_slots: 20; it was trained on 10"
+
+
+@pytest.mark.slow
+def test_its_best_policy_is_shipped(run, tmp_path):
+    """The script that ships the generalist does not train a run again that is there: here a tiny one."""
+    results, folder = run
+    out = run_script("ship_generalist.py", "--run", folder, "--into", tmp_path / "mine.npz")
+    assert "mine.npz" in out
+    shipped = load_policy(tmp_path / "mine.npz")
+    assert shipped.n_devices is None
+    assert shipped.trained_on["seed"] == results.agents["best_validation"].idxmax()
