@@ -41,6 +41,7 @@ from uavmec_jax.studies.study import (  # noqa: E402
     load_study,
     make_agents,
     make_algorithm,
+    seeds_of,
     validation_keys,
 )
 from uavmec_jax.world.distribution import ScenarioDistribution, scenario_of_draw  # noqa: E402
@@ -74,7 +75,7 @@ def main() -> None:
     distribution = jax.tree.map(lambda leaf: leaf[0], make_agents(study).scenario)
     lessons = collect(study, distribution, arguments.scenarios)
     collected = time.perf_counter() - tick
-    seeds = len(study.axes["seeds"]) if isinstance(study.axes["seeds"], list) else study.axes["seeds"]
+    seeds = len(seeds_of(study))
     weights = [imitate(study, lessons, seed, arguments.epochs) for seed in range(seeds)]
     learned = time.perf_counter() - tick - collected
     gentle = load_study("generalist", {"ppo.learning_rate": study.ppo.learning_rate / 3, **more})

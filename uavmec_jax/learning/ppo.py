@@ -76,9 +76,8 @@ def _iteration(spec: PPOSpec, agent: Agent, state: OnPolicyState, i: Any) -> OnP
     updates_done = i * spec.n_epochs * spec.minibatches
     steps_done = (i + 1) * spec.steps_per_iteration
     rows = _rows(samples)
-    hyper = agent.hyper
-    decay = hyper.learning_rate_decay ** (i / spec.iterations)
-    hyper = replace(hyper, learning_rate=hyper.learning_rate * decay)
+    decay = agent.hyper.learning_rate_decay ** (i / spec.iterations)
+    hyper = replace(agent.hyper, learning_rate=agent.hyper.learning_rate * decay)
 
     def epoch(carry: tuple[Descent, Array], numbered: tuple[Any, Any]) -> tuple[tuple[Descent, Array], None]:
         number, key = numbered

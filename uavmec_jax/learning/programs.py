@@ -13,9 +13,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Key
 
 from uavmec_jax.learning.algorithm import AGENTS_AXIS, Agent, Algorithm
-from uavmec_jax.world.distribution import ScenarioDistribution, play_draws, scenario_of_draw
+from uavmec_jax.world.distribution import ScenarioDistribution, priced_lives
 from uavmec_jax.world.environment import Scenario
-from uavmec_jax.world.rollout import Policy, returns
+from uavmec_jax.world.rollout import Policy, returns, rollouts
 
 
 @struct.dataclass
@@ -114,13 +114,9 @@ def _score(policy: Policy, plays: Scenario | ScenarioDistribution, keys: Key[Arr
 
     Where every draw is another scenario, lives are counted less the price of the first failure.
     """
-    played = play_draws(policy, plays, keys)
-    lives = played.length.astype(jnp.float32)
     if isinstance(plays, ScenarioDistribution):
-        traffic: Any = jax.vmap(partial(scenario_of_draw, plays))(keys).layout.traffic
-        price = traffic.price * jnp.sum(played.first_failure * traffic.weight[:, 0], axis=-1)
-        return jnp.mean(lives - price)
-    score = jnp.mean(lives)
+        return jnp.mean(priced_lives(policy, plays, keys))
+    score = jnp.mean(rollouts(policy, plays.params, plays.layout, keys).length.astype(jnp.float32))
     if plays.layout.traffic is not None:
         paid = (plays.reward.traffic_bonus > 0) | (plays.reward.traffic_penalty > 0)
         score = jnp.where(paid, jnp.mean(returns(policy, plays, keys)), score)

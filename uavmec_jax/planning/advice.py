@@ -102,7 +102,7 @@ def advise(
     futures = jax.random.split(jax.random.key(0) if key is None else key, samples)
     own, played = _try_all(policy, params, layout, state, futures)
     lives = np.asarray(played.length, float)
-    worth = lives - np.asarray(played.first_failure) @ _price(layout, state)
+    worth = lives - np.asarray(played.first_failure) @ np.asarray(layout.failure_price(state.elapsed))
     of_policy = int(own)
     best = int(np.argmax(worth.mean(axis=1) + 1e-3 * (np.arange(len(worth)) == of_policy)))
     end = jax.tree.map(lambda leaf: np.asarray(leaf[best]), played)
@@ -147,13 +147,6 @@ def _try_changes(
 def _play_changed(policy: Policy, params: Params, layouts: Layout, state: State, futures: Key[Array, " S"]) -> Array:
     one = lambda layout, future: play_on(policy, params, layout, state, future).length  # noqa: E731
     return jax.vmap(jax.vmap(one, (None, 0)), (0, None))(layouts, futures)
-
-
-def _price(layout: Layout, state: State) -> np.ndarray:
-    """``[n]`` slots of life that a first failure of each device costs."""
-    if layout.traffic is None:
-        return np.zeros(layout.capacity.shape)
-    return np.asarray(layout.traffic.price * layout.traffic.at(state.elapsed), float)
 
 
 def _ranked(lives: np.ndarray, worth: np.ndarray, best: int) -> tuple[Candidate, ...]:

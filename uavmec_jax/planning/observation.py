@@ -167,7 +167,7 @@ def _own(
         jnp.clip(spare_after / 8.0, -2.0, 2.0),
         jnp.clip(crowding_after / expiry, -2.0, 2.0),
         crowding_after <= 0.0,
-        _traffic(layout, state) / 8.0,
+        layout.failure_price(state.elapsed) / 8.0,
     ]
     return jnp.stack([jnp.asarray(column, jnp.float32) for column in columns], axis=-1)
 
@@ -180,14 +180,6 @@ def _due(params: Params, layout: Layout, age: Array) -> Float[Array, "*b n"]:
 def _rank(value: Float[Array, " n"]) -> Float[Array, " n"]:
     """How many entries are smaller than each."""
     return jnp.sum(value[None, :] < value[:, None], axis=1).astype(jnp.float32)
-
-
-def _traffic(layout: Layout, state: State) -> Float[Array, " n"]:
-    """Slots of life that the first failure of each device is priced at."""
-    if layout.traffic is None:
-        return jnp.zeros(layout.capacity.shape)
-    priced: Array = layout.traffic.price * layout.traffic.at(state.elapsed)
-    return priced
 
 
 def _after(params: Params, layout: Layout, state: State, known: _Known, slots: Any) -> tuple[Array, Array]:

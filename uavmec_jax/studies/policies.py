@@ -18,6 +18,8 @@ from uavmec_jax.planning.lookahead import rollout_planner
 from uavmec_jax.planning.observation import FEATURES
 from uavmec_jax.studies.collection import WEIGHTS, Collection, of_one, read_collection, sees_all, write_collection
 from uavmec_jax.studies.drawn import unlike
+from uavmec_jax.studies.durable.folder import STUDY
+from uavmec_jax.studies.study import load_study
 from uavmec_jax.world.layout import Layout
 from uavmec_jax.world.params import Params
 from uavmec_jax.world.physics import State
@@ -158,9 +160,6 @@ def load_policy(source: str | Path, which: str = "best", **axes: Any) -> Policy:
 
 
 def draws_scenarios(directory: Path) -> bool:
-    """Whether the agents of a run played scenarios drawn afresh, so that none belongs to a town.
-
-    Raises:
-        PolicyError: the folder holds no policies, or they are damaged.
-    """
-    return bool(read_collection(directory / WEIGHTS).drawn)
+    """Whether the agents of a run played scenarios drawn afresh, so that none belongs to a town: its study says so."""
+    path = directory / STUDY
+    return path.is_file() and load_study(path).scenarios is not None

@@ -96,12 +96,23 @@ def play_draws(policy: Policy, plays: Scenario | ScenarioDistribution, keys: Key
     """One episode per draw, leaves ``[D]``: of task volumes, or, of a distribution, of a scenario each besides."""
     if isinstance(plays, Scenario):
         return rollouts(policy, plays.params, plays.layout, keys)
+    return jax.vmap(lambda key: _play(policy, plays, key)[1])(keys)
 
-    def play(key: PRNGKeyArray) -> Episode:
-        scenario = scenario_of_draw(plays, key)
-        return rollout(policy, scenario.params, scenario.layout, key)
 
-    return jax.vmap(play)(keys)
+def priced_lives(policy: Policy, plays: ScenarioDistribution, keys: Key[Array, " D"]) -> Float[Array, " D"]:
+    """Slots that the episode of each draw lives, less the price of its first failure."""
+
+    def one(key: PRNGKeyArray) -> Array:
+        layout, played = _play(policy, plays, key)
+        return played.length.astype(jnp.float32) - jnp.sum(played.first_failure * layout.failure_price(0.0))
+
+    return jax.vmap(one)(keys)
+
+
+def _play(policy: Policy, plays: ScenarioDistribution, key: PRNGKeyArray) -> tuple[Layout, Episode]:
+    """The layout of a draw and the episode in it."""
+    scenario = scenario_of_draw(plays, key)
+    return scenario.layout, rollout(policy, scenario.params, scenario.layout, key)
 
 
 def _params(distribution: ScenarioDistribution, typical: Bool[Array, ""], numbers: Iterator[Array]) -> Params:

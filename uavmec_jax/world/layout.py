@@ -66,6 +66,12 @@ class Layout:
     traffic: Traffic | None = None
     present: Any = None
 
+    def failure_price(self, seconds: Any) -> Any:
+        """Slots of life ``[n]`` that the first failure of each device is priced at, at a time as in :meth:`Traffic.at`."""
+        if self.traffic is None:
+            return jnp.zeros(self.capacity.shape)
+        return self.traffic.price * self.traffic.at(seconds)
+
 
 def make_layout(
     position: Float[Array, "n 2"],
