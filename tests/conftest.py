@@ -1,6 +1,7 @@
 """Every test runs with shapes and types checked at run time, and with two CPU devices."""
 
 import os
+import sys
 import tempfile
 
 # The same program is compiled once in a session, whichever worker, test or subprocess asks for it: the first process
@@ -9,6 +10,13 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     _cache = tempfile.TemporaryDirectory(prefix="uavmec-jax-tests-")
     os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache.name
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
+
+# The tests start some hundred processes. Where Python is told to leave no bytecode beside the sources, each would
+# compile all that it imports again, for seconds: it is left in a folder that goes with the session.
+if os.environ.pop("PYTHONDONTWRITEBYTECODE", ""):
+    _bytecode = tempfile.TemporaryDirectory(prefix="uavmec-jax-bytecode-")
+    os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix = _bytecode.name
+    sys.dont_write_bytecode = False
 
 import jax
 from jaxtyping import install_import_hook

@@ -41,28 +41,45 @@ def test_the_uninterrupted_run_takes_snapshots_and_tidies_up(folder):
 
 def test_killed_twenty_times_it_ends_with_the_same_bits(folder):
     """SIGKILL at random moments: while it starts, trains, writes a snapshot, judges, puts the results together."""
-    moments = random.Random(5)
-    kills, runs = 0, 0
+    chance = random.Random(5)
+    kills, runs, restored = 0, 0, 0
     while kills < KILLS:
         runs += 1
-        out = f"killed-{runs}"
-        arguments = ["run", "tiny.toml", *TRAINED_LONG, "--out", out]
+        out = folder / f"killed-{runs}"
+        arguments = ["run", "tiny.toml", *TRAINED_LONG, "--snapshot-share", "0.5", "--out", out.name]
         while True:
             process = start(*arguments, cwd=folder)
             if kills < KILLS:
-                time.sleep(moments.uniform(1.0, 8.0))
+                wait_for_a_moment(chance, process, out)
                 if process.poll() is None:
                     process.kill()
                     kills += 1
             _, errors = process.communicate(timeout=120)
-            if (folder / out / "plan.json").exists():
-                arguments = ["resume", out]
+            if (out / "plan.json").exists():
+                arguments = ["resume", out.name]
             if process.returncode != -signal.SIGKILL:
                 assert process.returncode == 0, errors
                 break
-        assert bits(folder / out) == bits(folder / "whole"), f"after {kills} kills"
-        assert not (folder / out / "shards").exists()
-    assert any(events(folder / f"killed-{k + 1}", "restored") for k in range(runs))
+        assert bits(out) == bits(folder / "whole"), f"after {kills} kills"
+        assert not (out / "shards").exists()
+        restored += len(events(out, "restored"))
+    assert restored >= 2
+
+
+def wait_for_a_moment(chance, process, out):
+    """One while it starts, or one of its work, which is found by what the run tells: machines differ in speed."""
+    if chance.random() < 0.6:
+        time.sleep(chance.uniform(0.0, 3.0))
+        return
+    told = lines_told(out) + chance.randint(1, 600)
+    while lines_told(out) < told and process.poll() is None:
+        time.sleep(0.01)
+    if chance.random() < 0.3:
+        time.sleep(chance.uniform(0.0, 4.0))
+
+
+def lines_told(out):
+    return sum(file.read_bytes().count(b"\n") for file in (out / "log").glob("*.jsonl"))
 
 
 def test_told_to_stop_it_keeps_all_and_says_how_to_go_on(folder):
