@@ -9,7 +9,7 @@ import tempfile
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     _cache = tempfile.TemporaryDirectory(prefix="uavmec-jax-tests-")
     os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache.name
-os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.05"
 
 # The tests start some hundred processes. Where Python is told to leave no bytecode beside the sources, each would
 # compile all that it imports again, for seconds: it is left in a folder that goes with the session.

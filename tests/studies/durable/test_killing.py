@@ -20,8 +20,8 @@ pytestmark = pytest.mark.slow
 
 KILLS = 20
 
-TRAINED_LONG = ["--set", "steps=150000", "--shard-size", "2", "--snapshot-every", "0"]
-"""Two shards of a few seconds, with snapshots as often as they are cheap."""
+TRAINED_LONG = ["--set", "steps=60000", "--shard-size", "2", "--snapshot-every", "0"]
+"""Two shards of a second or two, with snapshots as often as they are cheap."""
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,7 @@ def wait_for_a_moment(chance, process, out):
     if chance.random() < 0.6:
         time.sleep(chance.uniform(0.0, 3.0))
         return
-    told = lines_told(out) + chance.randint(1, 600)
+    told = lines_told(out) + chance.randint(1, 300)
     while lines_told(out) < told and process.poll() is None:
         time.sleep(0.01)
     if chance.random() < 0.3:
@@ -99,7 +99,7 @@ def test_told_to_stop_it_keeps_all_and_says_how_to_go_on(folder):
 
 def test_a_workers_shard_is_finished_by_another(folder):
     """Two workers with one core each, on a run planned for two: the same bits as on both cores in one process."""
-    prepare_run(load_study(folder / "tiny.toml", {"steps": 150_000}), folder / "team", shard_size=2)
+    prepare_run(load_study(folder / "tiny.toml", {"steps": 60_000}), folder / "team", shard_size=2)
     team = [start("worker", "team", "--share", f"{k}/2", cwd=folder) for k in (1, 2)]
     wait_for(lambda: len(events(folder / "team", "chunk")) > 40, team[0])
     wait_for(lambda: len(events(folder / "team", "claimed")) == 2, team[1])
