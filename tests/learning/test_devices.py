@@ -33,6 +33,7 @@ print(hashlib.sha256(b"".join(np.ascontiguousarray(leaf).tobytes() for leaf in l
 
 
 @pytest.mark.slow
+@pytest.mark.bits
 def test_the_same_bits_on_one_two_and_four_devices():
     command = [sys.executable, "-c", SCRIPT]
     runs = [

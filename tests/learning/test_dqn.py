@@ -172,6 +172,7 @@ def test_chunks_do_not_matter():
 
 
 @pytest.mark.slow
+@pytest.mark.bits
 def test_batched_agent_is_the_agent_alone():
     hypers = [{}, {"gamma": 0.9}, {"learning_rate": 1e-3, "target_interval": 500}, {"learning_starts": 400}]
     agents = [make_agent(i, powered=4 + 2 * i, **hyper) for i, hyper in enumerate(hypers)]

@@ -30,6 +30,7 @@ def permuted(order, layout, state):
     return jax.tree.map(take, layout), state.replace(battery=state.battery[order], age=state.age[order])
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("n", [*(pytest.param(n, marks=pytest.mark.slow) for n in (2, 64)), 5, 12])
 def test_permuting_devices_permutes_the_logits_and_nothing_else(n):
     rng = np.random.default_rng(n)
@@ -43,7 +44,7 @@ def test_permuting_devices_permutes_the_logits_and_nothing_else(n):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("n", [pytest.param(3, marks=pytest.mark.slow), 12])
+@pytest.mark.parametrize("n", [3, 12])
 def test_padding_changes_nothing(n):
     params, layout, state = mid_life(1, n)
     logits, value = judge(params, layout, state)
@@ -56,6 +57,7 @@ def test_padding_changes_nothing(n):
 
 
 @pytest.mark.slow
+@pytest.mark.bits
 def test_padding_may_stand_anywhere():
     params, layout, state = mid_life(2, 5)
     padded = pad_layout(layout, 8)

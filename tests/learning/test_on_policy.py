@@ -88,6 +88,7 @@ def test_a_cut_off_episode_is_bootstrapped():
 
 
 @pytest.mark.slow
+@pytest.mark.bits
 @pytest.mark.parametrize("name", BOTH)
 def test_an_agent_is_itself_whoever_trains_beside_it(name):
     agents = population(name, {}, {"gamma": 0.9}, {"learning_rate": 1e-3})

@@ -93,6 +93,7 @@ def test_best_weights_are_those_of_the_best_look():
 
 
 @pytest.mark.slow
+@pytest.mark.bits
 def test_blocks_padding_and_devices_do_not_change_an_agent():
     agents = stack([make_agent(i) for i in range(5)])
     (whole,), _ = train(agents, 1000, blocks=Blocks(1, 6, 2, 0))

@@ -67,6 +67,7 @@ def test_other_scenarios_fill_their_ranges():
 _MORE = ("oldest-first", "earliest-deadline", "random", "lowest-battery")
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize(
     "name", ["round-robin", "shortest-tour", *(pytest.param(name, marks=pytest.mark.slow) for name in _MORE)]
 )

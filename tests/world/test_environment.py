@@ -119,6 +119,7 @@ def test_rollouts_differ_by_draw_and_repeat_by_key():
 
 
 @pytest.mark.slow
+@pytest.mark.bits
 def test_jit_and_vmap_change_nothing():
     layouts = jax.vmap(lambda key: sample_layout(key, PARAMS, 6, 6))(jax.random.split(jax.random.key(0), 5))
     volumes = jax.random.uniform(jax.random.key(1), (5, 12), minval=2e6, maxval=4e6)

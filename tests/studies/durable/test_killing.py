@@ -69,7 +69,7 @@ def test_killed_twenty_times_it_ends_with_the_same_bits(folder):
 def wait_for_a_moment(chance, process, out):
     """One while it starts, or one of its work, which is found by what the run tells: machines differ in speed."""
     if chance.random() < 0.6:
-        time.sleep(chance.uniform(0.0, 3.0))
+        time.sleep(chance.uniform(0.0, 2.0))
         return
     told = lines_told(out) + chance.randint(1, 300)
     while lines_told(out) < told and process.poll() is None:
