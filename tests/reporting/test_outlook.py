@@ -27,6 +27,7 @@ def harbour(tmp_path_factory):
     return json.loads(done.stdout), directory
 
 
+@pytest.mark.slow
 def test_json_says_everything(harbour):
     data, _ = harbour
     assert set(data["policies"]) == {*HEURISTICS, "rollout", "beam"}
@@ -46,6 +47,7 @@ def test_json_says_everything(harbour):
     assert changes == removals | power | comms
 
 
+@pytest.mark.slow
 def test_slots_add_up(harbour):
     data, _ = harbour
     slots = data["slots"]["rollout"]
@@ -62,6 +64,7 @@ def test_slots_add_up(harbour):
         here = there
 
 
+@pytest.mark.slow
 def test_files(harbour):
     data, directory = harbour
     assert {file.name for file in directory.iterdir()} == {"plan.json", "plan.png", "plan.geojson", "layout.toml"}
