@@ -78,12 +78,19 @@ def main() -> None:
     parser.add_argument("--policy", default="generalist")
     parser.add_argument("--towns", type=int, default=100)
     parser.add_argument("--draws", type=int, default=4)
-    parser.add_argument("--only", nargs="+", help="these kinds of scenarios, and their traffic, and random weights")
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        choices=list(kinds()),
+        default=list(kinds()),
+        metavar="KIND",
+        help="these kinds of scenarios, and their traffic, and random weights",
+    )
     parser.add_argument("--out", type=Path, default=Path("results/generalist"))
     arguments = parser.parse_args()
 
     policy = load_policy(arguments.policy)
-    chosen = {name: kind for name, kind in kinds().items() if name in (arguments.only or kinds())}
+    chosen = {name: kind for name, kind in kinds().items() if name in arguments.only}
     elsewhere = pd.DataFrame(
         [row(name, *kind, policy, arguments.towns, arguments.draws) for name, kind in chosen.items()]
     )

@@ -112,7 +112,7 @@ def test_traffic_has_a_price():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("n", [2, 30])
+@pytest.mark.parametrize("n", [2, 12, 30])
 def test_the_shipped_policy_is_a_policy_like_any_other(generalist, n):
     params = um.Params(n_devices=n)
     layout = um.sample_layout(jax.random.key(n), params, n // 2, n // 2)

@@ -5,6 +5,7 @@ import json
 import pytest
 
 from tests.experiments.scripts import run
+from uavmec_jax.studies.policies import load_policy
 
 pytestmark = pytest.mark.slow
 
@@ -27,11 +28,17 @@ def test_generalist_planners(tmp_path):
 
 
 def test_generalist_elsewhere_and_speed(tmp_path):
-    few = ("--towns", 2, "--draws", 1, "--only", "6 devices", "round_lake")
+    few = ("--towns", 2, "--draws", 1, "--only", "6 devices", "48 devices", "round_lake")
     out = run("generalist_elsewhere.py", *few, "--out", tmp_path)
-    assert "6 devices" in out
+    assert "48 devices" in out
     assert "random weights" in out
     assert (tmp_path / "traffic.png").exists()
     run("generalist_speed.py", "--scenarios", 256, "--repetitions", 3, "--out", tmp_path)
     rows = json.loads((tmp_path / "speed.json").read_text())["policies"]
     assert all(row["decisions_per_second"] > 0 for row in rows.values())
+
+
+def test_ship_generalist(tmp_path):
+    out = run("ship_generalist.py", "--run", tmp_path / "run", "--into", tmp_path / "mine.npz", "--steps", 16_384)
+    assert "mine.npz" in out
+    assert load_policy(tmp_path / "mine.npz").n_devices is None

@@ -31,7 +31,7 @@ def permuted(order, layout, state):
 
 
 @pytest.mark.bits
-@pytest.mark.parametrize("n", [*(pytest.param(n, marks=pytest.mark.slow) for n in (2, 64)), 5, 12])
+@pytest.mark.parametrize("n", [*(pytest.param(n, marks=pytest.mark.slow) for n in (2, 24, 64)), 5, 12])
 def test_permuting_devices_permutes_the_logits_and_nothing_else(n):
     rng = np.random.default_rng(n)
     for seed in range(6):

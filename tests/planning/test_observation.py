@@ -98,7 +98,7 @@ def test_entries_that_are_no_devices_show_nothing():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("n", [2, 64])
+@pytest.mark.parametrize("n", [2, 12, 64])
 def test_all_features_are_finite_and_moderate(n):
     for seed in range(3):
         params, layout, state = mid_life(seed, n)

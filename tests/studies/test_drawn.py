@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
 from tests.experiments.scripts import run as run_script
 from tests.learning.agents import take
@@ -186,6 +186,14 @@ def test_what_is_unlike_the_training_is_named():
     assert named == ["devices", "extent in m", "the UAV's speed in m/s", "data_age_limit_slots"]
     assert found[0] == "devices: 40; it was trained on 4 to 16"
     assert found[-1] == "data_age_limit_slots: 20; it was trained on 10"
+
+
+@pytest.mark.slow
+def test_the_paper_s_observation_learns_on_drawn_scenarios_too():
+    """Nothing ties drawn scenarios to the full observation: a network of the paper's words takes layouts of one size."""
+    study = study_of(TOML.replace('observation = "full"', 'observation = "paper"'), **{"axes.seeds": 1})
+    results = run_study(study)
+    assert_allclose(results.agents["diverged_at"], -1)
 
 
 @pytest.mark.slow
