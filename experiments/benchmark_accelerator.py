@@ -26,13 +26,13 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="small sizes: a test of the script")
     arguments = parser.parse_args()
 
-    from uavmec_jax.studies import host
+    from uavmec_jax.training import host
 
     host.use_every_core()
-    from uavmec_jax.files import write_text
+    from uavmec_jax.files.writing import write_text
     from uavmec_jax.reporting import canvas, figures
-    from uavmec_jax.studies.run import run_or_resume
-    from uavmec_jax.studies.speed import environment_speed
+    from uavmec_jax.runs.run import run_or_resume
+    from uavmec_jax.runs.speed import environment_speed
     from uavmec_jax.studies.study import load_study
 
     quick = arguments.quick

@@ -23,7 +23,7 @@ def train_speed(n_agents: int, seconds: float) -> dict:
     import jax
     import jax.numpy as jnp
 
-    from uavmec_jax.studies.speed import training_speed
+    from uavmec_jax.runs.speed import training_speed
     from uavmec_jax.studies.study import parse_study
 
     axes = f"[axes]\npowered = [8]\nconnected = [8]\nseeds = {n_agents}"
@@ -45,7 +45,7 @@ def ceiling(agents_per_device: int, seconds: float) -> float:
     import numpy as np
     from jax.sharding import Mesh, PartitionSpec
 
-    from uavmec_jax.learning.networks import matmul
+    from uavmec_jax.agents.networks import matmul
 
     devices = jax.local_devices()
     mesh = Mesh(np.array(devices), ("agents",))
@@ -141,7 +141,7 @@ def main() -> None:
     if arguments.sb3_worker:
         sb3_worker(arguments.seconds)
         return
-    from uavmec_jax.studies import host
+    from uavmec_jax.training import host
 
     host.use_every_core()
     from importlib.util import find_spec
@@ -149,8 +149,8 @@ def main() -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from uavmec_jax.learning.blocks import AGENTS_PER_CORE
-    from uavmec_jax.studies.speed import environment_speed
+    from uavmec_jax.runs.speed import environment_speed
+    from uavmec_jax.training.partition import AGENTS_PER_CORE
 
     facts = host.describe()
     report = {"command": " ".join(["python", *sys.argv]), **facts, "filled_transitions_per_agent": FILLED}

@@ -20,7 +20,7 @@ AGENTS = (1, 8, 75, 300)
 
 def train_speed(algorithm: str, n_agents: int, seconds: float, n_envs: int = 1) -> dict:
     """Environment steps/s of training with ``n_agents`` agents."""
-    from uavmec_jax.studies.speed import training_speed
+    from uavmec_jax.runs.speed import training_speed
     from uavmec_jax.studies.study import parse_study
 
     axes = f"[axes]\npowered = [8]\nconnected = [8]\nseeds = {n_agents}"
@@ -62,7 +62,7 @@ def main() -> None:
     if arguments.sb3_worker:
         sb3_worker(arguments.sb3_worker, arguments.seconds)
         return
-    from uavmec_jax.studies import host
+    from uavmec_jax.training import host
 
     host.use_every_core()
     from importlib.util import find_spec

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from uavmec_jax.studies import host
+from uavmec_jax.training import host
 
 host.use_every_core()
 
@@ -20,11 +20,11 @@ import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
-from uavmec_jax.planning.beam import horizon  # noqa: E402
-from uavmec_jax.planning.lookahead import SAMPLES  # noqa: E402
-from uavmec_jax.planning.parallel import bound_all, play_beam, play_rollout  # noqa: E402
-from uavmec_jax.studies.study import held_out_draws, town  # noqa: E402
-from uavmec_jax.world.params import Params  # noqa: E402
+from uavmec_jax.env.params import Params
+from uavmec_jax.planning.beam import horizon
+from uavmec_jax.planning.parallel import bound_all, play_beam, play_rollout
+from uavmec_jax.planning.rollout_planner import SAMPLES
+from uavmec_jax.scenarios.seeds import held_out_draws, town
 
 CELLS = [(12, 4), (10, 10), (8, 8), (4, 4)]
 

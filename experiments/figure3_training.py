@@ -10,17 +10,17 @@ Thin lines: training episodes, 10,000 steps at a time; thick lines: the greedy p
 import argparse
 from pathlib import Path
 
-from uavmec_jax.studies import host
+from uavmec_jax.training import host
 
 host.use_every_core()
 
 import numpy as np  # noqa: E402
 import pandas as pd  # noqa: E402
 
-from uavmec_jax.reporting import canvas  # noqa: E402
-from uavmec_jax.studies.results import Results  # noqa: E402
-from uavmec_jax.studies.run import run_study  # noqa: E402
-from uavmec_jax.studies.study import parse_study  # noqa: E402
+from uavmec_jax.reporting import canvas
+from uavmec_jax.runs.run import run_study
+from uavmec_jax.studies.results import Results
+from uavmec_jax.studies.study import parse_study
 
 ONE_LAYOUT = "[axes]\npowered = [8]\nconnected = [8]\nseeds = {seeds}\n"
 

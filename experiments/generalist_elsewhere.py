@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from uavmec_jax.studies import host
+from uavmec_jax.training import host
 
 host.use_every_core()
 
@@ -22,16 +22,16 @@ import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 import pandas as pd  # noqa: E402
+from generalist_figures import trade_off_figure
 
-from uavmec_jax.planning.heuristics import HEURISTICS  # noqa: E402
-from uavmec_jax.planning.parallel import play_policy  # noqa: E402
-from uavmec_jax.reporting.generalist import trade_off_figure  # noqa: E402
-from uavmec_jax.studies.places import on_place  # noqa: E402
-from uavmec_jax.studies.policies import load_policy  # noqa: E402
-from uavmec_jax.studies.statistics import mean_interval  # noqa: E402
-from uavmec_jax.traffic.evacuation import HIGH_TRAFFIC, load_evacuation  # noqa: E402
-from uavmec_jax.world.layout import Layout, Traffic, sample_layout  # noqa: E402
-from uavmec_jax.world.params import Params  # noqa: E402
+from uavmec_jax.env.layout import Layout, Traffic, sample_layout
+from uavmec_jax.env.params import Params
+from uavmec_jax.planning.heuristics import HEURISTICS
+from uavmec_jax.planning.parallel import play_policy
+from uavmec_jax.scenarios.places import on_place
+from uavmec_jax.scenarios.policies import load_policy
+from uavmec_jax.studies.statistics import mean_interval
+from uavmec_jax.traffic.evacuation import HIGH_TRAFFIC, load_evacuation
 
 PLACES = ("albany", "round_lake")
 PRICES = (0.0, 2.0, 5.0, 10.0, 20.0)

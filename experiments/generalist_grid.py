@@ -14,23 +14,23 @@ import time
 from pathlib import Path
 from typing import Any
 
-from uavmec_jax.studies import host
+from uavmec_jax.training import host
 
 host.use_every_core()
 
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
 import pandas as pd  # noqa: E402
+from forecast_quality import forecast_first_failure, judge_forecasts, with_nobody
+from generalist_figures import ratio_figure, reliability_figure
 
-from uavmec_jax.planning.parallel import play_policy  # noqa: E402
-from uavmec_jax.reporting.generalist import ratio_figure, reliability_figure  # noqa: E402
-from uavmec_jax.studies.archive import load_results  # noqa: E402
-from uavmec_jax.studies.forecasts import forecast_first_failure, judge_forecasts, with_nobody  # noqa: E402
-from uavmec_jax.studies.policies import load_policy  # noqa: E402
-from uavmec_jax.studies.results import Results  # noqa: E402
-from uavmec_jax.studies.statistics import mean_interval  # noqa: E402
-from uavmec_jax.studies.study import evaluation_keys, make_agents  # noqa: E402
-from uavmec_jax.world.rollout import Policy  # noqa: E402
+from uavmec_jax.env.rollout import Policy
+from uavmec_jax.planning.parallel import play_policy
+from uavmec_jax.runs.results_folder import load_results
+from uavmec_jax.scenarios.policies import load_policy
+from uavmec_jax.studies.population import evaluation_keys, make_agents
+from uavmec_jax.studies.results import Results
+from uavmec_jax.studies.statistics import mean_interval
 
 _LADDER = ("oldest_first", "dqn_best", "dqn_last", "generalist", "earliest_deadline", "rollout", "beam", "bound")
 _PER_CALL = 250

@@ -14,20 +14,21 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from uavmec_jax.studies import host
+from uavmec_jax.training import host
 
 host.use_every_core()
 
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
 
-from uavmec_jax.planning.beam import horizon  # noqa: E402
-from uavmec_jax.planning.heuristics import HEURISTICS  # noqa: E402
-from uavmec_jax.planning.lookahead import SAMPLES  # noqa: E402
-from uavmec_jax.planning.parallel import play_beam, play_policy, play_rollout  # noqa: E402
-from uavmec_jax.studies.policies import TrainedPolicy, load_policy  # noqa: E402
-from uavmec_jax.studies.statistics import mean_interval  # noqa: E402
-from uavmec_jax.studies.study import evaluation_keys, load_study, make_agents  # noqa: E402
+from uavmec_jax.planning.beam import horizon
+from uavmec_jax.planning.heuristics import HEURISTICS
+from uavmec_jax.planning.parallel import play_beam, play_policy, play_rollout
+from uavmec_jax.planning.rollout_planner import SAMPLES
+from uavmec_jax.scenarios.policies import TrainedPolicy, load_policy
+from uavmec_jax.studies.population import evaluation_keys, make_agents
+from uavmec_jax.studies.statistics import mean_interval
+from uavmec_jax.studies.study import load_study
 
 
 def main() -> None:

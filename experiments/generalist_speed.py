@@ -13,19 +13,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from uavmec_jax.studies import host
+from uavmec_jax.training import host
 
 host.use_every_core()
 
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
 
-from uavmec_jax.planning.heuristics import HEURISTICS  # noqa: E402
-from uavmec_jax.planning.parallel import spread  # noqa: E402
-from uavmec_jax.studies.policies import load_policy  # noqa: E402
-from uavmec_jax.world.layout import sample_layout  # noqa: E402
-from uavmec_jax.world.params import Params  # noqa: E402
-from uavmec_jax.world.physics import initial_state  # noqa: E402
+from uavmec_jax.env.dynamics import initial_state
+from uavmec_jax.env.layout import sample_layout
+from uavmec_jax.env.params import Params
+from uavmec_jax.planning.heuristics import HEURISTICS
+from uavmec_jax.planning.parallel import spread
+from uavmec_jax.scenarios.policies import load_policy
 
 _BATCH = 256
 """Scenarios that a core decides for at once."""

@@ -17,36 +17,30 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from uavmec_jax.studies import host
+from uavmec_jax.training import host
 
 host.use_every_core()
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
+from generalist_figures import training_figure
 
-from uavmec_jax.learning import on_policy  # noqa: E402
-from uavmec_jax.learning.estimates import log_probability  # noqa: E402
-from uavmec_jax.learning.optimizers import Descent, clipped_adam, descend  # noqa: E402
-from uavmec_jax.learning.registry import ALGORITHMS  # noqa: E402
-from uavmec_jax.learning.training import Trainer, Training, Validation  # noqa: E402
-from uavmec_jax.planning.beam import WIDTH, beam_search, horizon, longest  # noqa: E402
-from uavmec_jax.planning.parallel import spread  # noqa: E402
-from uavmec_jax.reporting.generalist import training_figure  # noqa: E402
-from uavmec_jax.studies.archive import load_results  # noqa: E402
-from uavmec_jax.studies.plan import plan_study  # noqa: E402
-from uavmec_jax.studies.schema import Study  # noqa: E402
-from uavmec_jax.studies.study import (  # noqa: E402
-    evaluation_keys,
-    load_study,
-    make_agents,
-    make_algorithm,
-    seeds_of,
-    validation_keys,
-)
-from uavmec_jax.world.distribution import ScenarioDistribution, scenario_of_draw  # noqa: E402
-from uavmec_jax.world.physics import initial_state  # noqa: E402
-from uavmec_jax.world.rollout import rollouts, tour_policy, trace, volume_table  # noqa: E402
+from uavmec_jax.agents import on_policy
+from uavmec_jax.agents.gae import log_probability
+from uavmec_jax.agents.optimizers import Descent, clipped_adam, descend
+from uavmec_jax.agents.registry import ALGORITHMS
+from uavmec_jax.env.dynamics import initial_state
+from uavmec_jax.env.generator import ScenarioDistribution, scenario_of_draw
+from uavmec_jax.env.rollout import rollouts, tour_policy, trace, volume_table
+from uavmec_jax.planning.beam import WIDTH, beam_search, horizon, longest
+from uavmec_jax.planning.parallel import spread
+from uavmec_jax.runs.results_folder import load_results
+from uavmec_jax.runs.run_plan import plan_study
+from uavmec_jax.studies.population import evaluation_keys, make_agents, make_algorithm, seeds_of, validation_keys
+from uavmec_jax.studies.schema import Study
+from uavmec_jax.studies.study import load_study
+from uavmec_jax.training.training import Trainer, Training, Validation
 
 _OPTIMIZER = clipped_adam(eps=1e-5)
 _BATCH = 1024

@@ -27,10 +27,11 @@ def sb3_worker(seeds: list[int], steps: int) -> None:
     import torch
     from stable_baselines3 import DQN
 
+    from uavmec_jax.env.dynamics import Cause, initial_state, transition
+    from uavmec_jax.env.observation import observe
+    from uavmec_jax.env.rollout import volume_table
+    from uavmec_jax.env.scenario import make_scenario
     from uavmec_jax.interop.gymnasium_env import UavMecGymEnv
-    from uavmec_jax.world.environment import make_scenario, observe
-    from uavmec_jax.world.physics import Cause, initial_state, transition
-    from uavmec_jax.world.rollout import volume_table
 
     torch.set_num_threads(1)
     scenario = make_scenario(layout())
@@ -56,15 +57,15 @@ def sb3_worker(seeds: list[int], steps: int) -> None:
 
 def layout() -> Any:
     """The one layout: what studies call seed 0 with 8 powered and 8 connected devices."""
-    from uavmec_jax.studies.study import town
-    from uavmec_jax.world.params import Params
+    from uavmec_jax.env.params import Params
+    from uavmec_jax.scenarios.seeds import town
 
     return town(0, Params(), 8, 8)
 
 
 def draws() -> Any:
     """The volume draws that both are judged on."""
-    from uavmec_jax.studies.study import held_out_draws
+    from uavmec_jax.scenarios.seeds import held_out_draws
 
     return held_out_draws(0, 8, 8, DRAWS)
 
@@ -74,13 +75,13 @@ def ours(seeds: int, steps: int) -> list[float]:
     import jax
     import jax.numpy as jnp
 
-    from uavmec_jax.learning import dqn, population
-    from uavmec_jax.learning.algorithm import Agent
-    from uavmec_jax.learning.blocks import plan_blocks
-    from uavmec_jax.learning.training import Validation
-    from uavmec_jax.studies import host
-    from uavmec_jax.world.environment import make_scenario
-    from uavmec_jax.world.rollout import rollouts
+    from uavmec_jax.agents import dqn
+    from uavmec_jax.agents.algorithm import Agent
+    from uavmec_jax.env.rollout import rollouts
+    from uavmec_jax.env.scenario import make_scenario
+    from uavmec_jax.training import host, population
+    from uavmec_jax.training.partition import plan_blocks
+    from uavmec_jax.training.training import Validation
 
     host.use_every_core()
     algorithm = dqn.algorithm(dqn.DQNSpec(total_steps=steps))

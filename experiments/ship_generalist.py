@@ -10,13 +10,13 @@ model card.
 import argparse
 from pathlib import Path
 
-from uavmec_jax.studies import host
+from uavmec_jax.training import host
 
 host.use_every_core()
 
-from uavmec_jax.studies.policies import TrainedPolicy, load_policy  # noqa: E402
-from uavmec_jax.studies.run import run_or_resume  # noqa: E402
-from uavmec_jax.studies.study import load_study  # noqa: E402
+from uavmec_jax.runs.run import run_or_resume
+from uavmec_jax.scenarios.policies import TrainedPolicy, load_policy
+from uavmec_jax.studies.study import load_study
 
 PACKAGED = Path(__file__).parents[1] / "uavmec_jax" / "studies" / "library" / "generalist.npz"
 

@@ -46,13 +46,13 @@ def main() -> None:
     command = [sys.executable, "-m", "uavmec_jax", "run", arguments.study, *settings, "--out", str(arguments.out)]
     measured = watched(command, arguments.out)
 
-    from uavmec_jax.studies import host
+    from uavmec_jax.training import host
 
     host.use_every_core()
-    from uavmec_jax.files import write_text
-    from uavmec_jax.studies.archive import load_results
-    from uavmec_jax.studies.plan import plan_study
-    from uavmec_jax.studies.simulate import simulate
+    from uavmec_jax.files.writing import write_text
+    from uavmec_jax.runs.results_folder import load_results
+    from uavmec_jax.runs.run_plan import plan_study
+    from uavmec_jax.runs.simulate import simulate
     from uavmec_jax.studies.study import load_study
 
     run = load_results(arguments.out).run

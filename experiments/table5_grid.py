@@ -8,15 +8,15 @@ The same as `uavmec run table5 --seeds 10`, as a script to start one's own from.
 import argparse
 from pathlib import Path
 
-from uavmec_jax.studies import host
+from uavmec_jax.training import host
 
 host.use_every_core()
 
 from rich.console import Console  # noqa: E402
 
-from uavmec_jax.reporting import canvas, figures, tables  # noqa: E402
-from uavmec_jax.studies.run import run_study  # noqa: E402
-from uavmec_jax.studies.study import load_study  # noqa: E402
+from uavmec_jax.reporting import canvas, figures, tables
+from uavmec_jax.runs.run import run_study
+from uavmec_jax.studies.study import load_study
 
 
 def run(study: str, seeds: int, about: str) -> None:

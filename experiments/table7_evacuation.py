@@ -10,22 +10,22 @@ simulated anew with SUMO first, and the study runs on those.
 import argparse
 from pathlib import Path
 
-from uavmec_jax.studies import host
+from uavmec_jax.training import host
 
 host.use_every_core()
 
 from rich.console import Console  # noqa: E402
 
-from uavmec_jax.planning.heuristics import HEURISTICS  # noqa: E402
-from uavmec_jax.reporting import canvas, figures, tables  # noqa: E402
-from uavmec_jax.reporting.animation import save_animation  # noqa: E402
-from uavmec_jax.reporting.road_map import map_figure  # noqa: E402
-from uavmec_jax.studies.run import run_study  # noqa: E402
-from uavmec_jax.studies.scenario import load_scenario  # noqa: E402
-from uavmec_jax.studies.study import load_study  # noqa: E402
-from uavmec_jax.traffic.build import build_evacuation  # noqa: E402
-from uavmec_jax.traffic.evacuation import load_evacuation  # noqa: E402
-from uavmec_jax.traffic.place import load_place  # noqa: E402
+from uavmec_jax.planning.heuristics import HEURISTICS
+from uavmec_jax.reporting import canvas, figures, tables
+from uavmec_jax.reporting.animation import save_animation
+from uavmec_jax.reporting.road_map import map_figure
+from uavmec_jax.runs.run import run_study
+from uavmec_jax.scenarios.load import load_scenario
+from uavmec_jax.studies.study import load_study
+from uavmec_jax.traffic.build import build_evacuation
+from uavmec_jax.traffic.evacuation import load_evacuation
+from uavmec_jax.traffic.place import load_place
 
 PLACES = ("round_lake", "albany")
 

@@ -17,11 +17,11 @@ import jax
 import rejax
 from rejax.evaluate import evaluate
 
+from uavmec_jax.env.rollout import rollouts
+from uavmec_jax.env.scenario import make_scenario
 from uavmec_jax.interop.five_values import FiveValueEnv, FiveValueParams
 from uavmec_jax.planning.heuristics import HEURISTICS
-from uavmec_jax.studies import host
-from uavmec_jax.world.environment import make_scenario
-from uavmec_jax.world.rollout import rollouts
+from uavmec_jax.training import host
 
 
 def main() -> None:

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from tests.experiments.scripts import run
-from uavmec_jax.studies.policies import load_policy
+from uavmec_jax.scenarios.policies import load_policy
 
 pytestmark = pytest.mark.slow
 

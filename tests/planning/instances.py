@@ -3,9 +3,9 @@
 import jax
 import numpy as np
 
-from uavmec_jax.world.layout import sample_layout
-from uavmec_jax.world.params import Params
-from uavmec_jax.world.rollout import volume_table
+from uavmec_jax.env.layout import sample_layout
+from uavmec_jax.env.params import Params
+from uavmec_jax.env.rollout import volume_table
 
 SLOTS = 64
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from tests.worlds import mid_life
+from tests.small_scenarios import mid_life
+from uavmec_jax.env.dynamics import initial_state
+from uavmec_jax.env.layout import Traffic
+from uavmec_jax.env.rollout import rollouts
 from uavmec_jax.planning.advice import advise
 from uavmec_jax.planning.changes import CHANGES
 from uavmec_jax.planning.heuristics import HEURISTICS
-from uavmec_jax.world.layout import Traffic
-from uavmec_jax.world.physics import initial_state
-from uavmec_jax.world.rollout import rollouts
 
 RULE = HEURISTICS["earliest-deadline"]
 SAMPLES = 64

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from tests.planning.instances import SLOTS, traced
+from uavmec_jax.env.dynamics import initial_state
+from uavmec_jax.env.params import Params
+from uavmec_jax.env.rollout import rollout, tour_policy, volume_table
 from uavmec_jax.planning import demand
 from uavmec_jax.planning.beam import _dominated, beam_search
-from uavmec_jax.studies.study import town
-from uavmec_jax.world.params import Params
-from uavmec_jax.world.physics import initial_state
-from uavmec_jax.world.rollout import rollout, tour_policy, volume_table
+from uavmec_jax.scenarios.seeds import town
 
 search = jax.jit(beam_search, static_argnums=3)
 PARAMS = traced(Params())

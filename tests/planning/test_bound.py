@@ -9,17 +9,17 @@ import pytest
 from numpy.testing import assert_allclose
 
 from tests.planning.instances import SLOTS, small_instance, traced
-from tests.worlds import three_devices
+from tests.small_scenarios import three_devices
+from uavmec_jax.env.params import Params
+from uavmec_jax.env.rollout import rollout, volume_table
 from uavmec_jax.planning.beam import beam_search, horizon
 from uavmec_jax.planning.bound import _refuted, upper_bound
 from uavmec_jax.planning.exact import exact_tour
 from uavmec_jax.planning.flight import Rounds
 from uavmec_jax.planning.heuristics import HEURISTICS
-from uavmec_jax.planning.lookahead import rollout_planner
 from uavmec_jax.planning.parallel import bound_all, play_beam, play_heuristics, play_rollout
-from uavmec_jax.studies.study import town
-from uavmec_jax.world.params import Params
-from uavmec_jax.world.rollout import rollout, volume_table
+from uavmec_jax.planning.rollout_planner import rollout_planner
+from uavmec_jax.scenarios.seeds import town
 
 search = jax.jit(beam_search, static_argnums=3)
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tests.planning.instances import SLOTS, small_instance, traced
+from uavmec_jax.env.rollout import rollout, tour_policy
 from uavmec_jax.planning.exact import exact_tour
-from uavmec_jax.world.rollout import rollout, tour_policy
 
 pytestmark = pytest.mark.slow
 

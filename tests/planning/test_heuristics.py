@@ -7,7 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.worlds import three_devices
+from tests.small_scenarios import three_devices
+from uavmec_jax.env.dynamics import initial_state
+from uavmec_jax.env.params import Params
+from uavmec_jax.env.rollout import rollout, trace
 from uavmec_jax.planning.deadlines import earliest_deadline
 from uavmec_jax.planning.heuristics import (
     HEURISTICS,
@@ -18,12 +21,9 @@ from uavmec_jax.planning.heuristics import (
     shortest_life,
     stay_put,
 )
-from uavmec_jax.planning.lookahead import rollout_planner
-from uavmec_jax.planning.tour import shortest_tour, two_opt
-from uavmec_jax.studies.study import town
-from uavmec_jax.world.params import Params
-from uavmec_jax.world.physics import initial_state
-from uavmec_jax.world.rollout import rollout, trace
+from uavmec_jax.planning.rollout_planner import rollout_planner
+from uavmec_jax.planning.shortest_tour import shortest_tour, two_opt
+from uavmec_jax.scenarios.seeds import town
 
 PARAMS, LAYOUT = Params(n_devices=3), three_devices()
 START = initial_state(PARAMS, LAYOUT)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from tests.worlds import mid_life, three_devices
+from tests.small_scenarios import mid_life, three_devices
+from uavmec_jax.env.dynamics import initial_state
+from uavmec_jax.env.layout import Traffic, pad_layout
+from uavmec_jax.env.params import Params
 from uavmec_jax.planning import deadlines, demand
 from uavmec_jax.planning.observation import FEATURES, observe_devices
-from uavmec_jax.world.layout import Traffic, pad_layout
-from uavmec_jax.world.params import Params
-from uavmec_jax.world.physics import initial_state
 
 observed = jax.jit(observe_devices)
 PLACE = {feature.name: number for number, feature in enumerate(FEATURES)}

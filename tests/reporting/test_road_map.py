@@ -7,16 +7,16 @@ from matplotlib.colors import to_rgba
 from numpy.testing import assert_allclose
 from PIL import Image
 
-from tests.traffic.towns import evacuation
+from tests.traffic.networks import evacuation
+from uavmec_jax.env.layout import sample_layout
+from uavmec_jax.env.params import Params
 from uavmec_jax.planning.heuristics import HEURISTICS
 from uavmec_jax.reporting.animation import save_animation
 from uavmec_jax.reporting.canvas import new_figure, save
 from uavmec_jax.reporting.evacuation import evacuation_data, evacuation_lines
 from uavmec_jax.reporting.road_map import COLOURS, LIMITS, colour_of, draw_roads, map_figure
-from uavmec_jax.studies.places import on_place
+from uavmec_jax.scenarios.places import on_place
 from uavmec_jax.traffic.evacuation import load_evacuation
-from uavmec_jax.world.layout import sample_layout
-from uavmec_jax.world.params import Params
 
 
 def test_seven_colours_in_the_papers_order():

@@ -10,8 +10,9 @@ from rich.console import Console
 from uavmec_jax.reporting import canvas, figures
 from uavmec_jax.reporting.table6 import is_table6, label_rewards
 from uavmec_jax.reporting.tables import tables
+from uavmec_jax.studies.population import identities
 from uavmec_jax.studies.results import Results
-from uavmec_jax.studies.study import identities, load_study
+from uavmec_jax.studies.study import load_study
 
 
 @pytest.fixture(scope="module")

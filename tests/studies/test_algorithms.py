@@ -6,12 +6,13 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from uavmec_jax.errors import StudyError
-from uavmec_jax.learning.population import Progress
-from uavmec_jax.studies.archive import load_results, load_weights
+from uavmec_jax.runs.results_folder import load_results
+from uavmec_jax.runs.run import run_study
+from uavmec_jax.runs.run_plan import plan_study
 from uavmec_jax.studies.evaluation import Distinct, Judgement
-from uavmec_jax.studies.plan import plan_study
-from uavmec_jax.studies.run import run_study
+from uavmec_jax.studies.results_files import load_weights
 from uavmec_jax.studies.study import parse_study
+from uavmec_jax.training.population import Progress
 
 TOML = """
 name = "three"

@@ -7,9 +7,17 @@ from numpy.testing import assert_allclose
 
 from uavmec_jax.errors import StudyError
 from uavmec_jax.reporting.compare import comparison
-from uavmec_jax.studies.compare import Side, differences, interquartile_mean, overall, pair, probability_of_improvement
+from uavmec_jax.studies.compare import (
+    Side,
+    differences,
+    interquartile_mean,
+    overall,
+    pair,
+    probability_of_improvement,
+)
+from uavmec_jax.studies.population import identities
 from uavmec_jax.studies.results import Results
-from uavmec_jax.studies.study import identities, parse_study
+from uavmec_jax.studies.study import parse_study
 
 # Two algorithms on four tasks, and what rliable 1.2.0 (metrics.py) says of them.
 X = np.array([[18, 16, 15, 12], [13, 10, 10, 10], [11, 18, 16, 19], [15, 16, 19, 17], [16, 15, 15, 19]], float)

@@ -20,9 +20,10 @@ from uavmec_jax.studies.first_failures import (
 )
 from uavmec_jax.studies.paper import TABLE7
 from uavmec_jax.studies.places import describe_places
+from uavmec_jax.studies.population import identities
 from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.statistics import sign_test
-from uavmec_jax.studies.study import identities, load_study
+from uavmec_jax.studies.study import load_study
 
 
 @pytest.fixture(scope="module")

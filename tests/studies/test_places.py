@@ -5,15 +5,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from tests.traffic.towns import evacuation
+from tests.traffic.networks import evacuation
 from uavmec_jax.errors import StudyError, TrafficError
 from uavmec_jax.reporting.tables import tables
-from uavmec_jax.studies.archive import load_results
-from uavmec_jax.studies.plan import plan_study
-from uavmec_jax.studies.policies import load_policy
-from uavmec_jax.studies.run import run_study
-from uavmec_jax.studies.scenario import load_scenario
-from uavmec_jax.studies.study import cell_axes, identities, load_study, make_agents, parse_study, study_toml
+from uavmec_jax.runs.results_folder import load_results
+from uavmec_jax.runs.run import run_study
+from uavmec_jax.runs.run_plan import plan_study
+from uavmec_jax.scenarios.load import load_scenario
+from uavmec_jax.scenarios.policies import load_policy
+from uavmec_jax.studies.population import cell_axes, identities, make_agents
+from uavmec_jax.studies.study import load_study, parse_study, study_toml
 from uavmec_jax.traffic.evacuation import load_evacuation
 
 TOML = """

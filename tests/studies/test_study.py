@@ -5,22 +5,20 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from uavmec_jax.env.rewards import REWARDS
 from uavmec_jax.errors import StudyError
 from uavmec_jax.studies import study as studies
 from uavmec_jax.studies.paper import TABLE6
-from uavmec_jax.studies.study import (
+from uavmec_jax.studies.population import (
     evaluation_keys,
     identities,
-    load_study,
     make_agents,
     make_algorithm,
     n_agents,
-    parse_study,
     parts,
-    study_toml,
     validation_keys,
 )
-from uavmec_jax.world.rewards import REWARDS
+from uavmec_jax.studies.study import load_study, parse_study, study_toml
 
 SMALL = """
 steps = 400

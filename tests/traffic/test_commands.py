@@ -7,7 +7,7 @@ import sys
 import pytest
 from click.testing import CliRunner
 
-from tests.traffic.towns import osm_town
+from tests.traffic.networks import osm_town
 from uavmec_jax.cli import main
 from uavmec_jax.traffic import sumo
 

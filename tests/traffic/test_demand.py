@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from tests.traffic.towns import village
+from tests.traffic.networks import village
 from uavmec_jax.errors import TrafficError
 from uavmec_jax.traffic.demand import departures, find_routes, write_trips
 from uavmec_jax.traffic.place import Demand

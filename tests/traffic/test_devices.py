@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from tests.traffic.towns import road, village
+from tests.traffic.networks import road, village
 from uavmec_jax.errors import TrafficError
 from uavmec_jax.traffic.demand import find_routes
 from uavmec_jax.traffic.devices import _named, farthest_points, place_devices

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from tests.traffic.towns import evacuation
+from tests.traffic.networks import evacuation
 from uavmec_jax.errors import PolicyError, TrafficError
-from uavmec_jax.files import read_checked, write_checked
-from uavmec_jax.studies.policies import load_policy
+from uavmec_jax.files.archives import read_checked, write_checked
+from uavmec_jax.scenarios.policies import load_policy
 from uavmec_jax.traffic.evacuation import HIGH_TRAFFIC, load_evacuation
 from uavmec_jax.traffic.place import load_place
 

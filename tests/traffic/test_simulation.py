@@ -16,8 +16,8 @@ import pytest
 from click.testing import CliRunner
 from numpy.testing import assert_allclose, assert_array_equal
 
-from tests.traffic.test_workshop import wait_for
-from tests.traffic.towns import osm_town
+from tests.traffic.networks import osm_town
+from tests.traffic.test_workspace import wait_for
 from uavmec_jax.cli import main
 from uavmec_jax.errors import TrafficError
 from uavmec_jax.traffic import network, sumo
@@ -25,7 +25,7 @@ from uavmec_jax.traffic.build import build_evacuation
 from uavmec_jax.traffic.evacuation import load_evacuation
 from uavmec_jax.traffic.network import build_network
 from uavmec_jax.traffic.place import load_place, make_place
-from uavmec_jax.traffic.workshop import Workshop
+from uavmec_jax.traffic.workspace import Workshop
 
 pytestmark = pytest.mark.sumo
 

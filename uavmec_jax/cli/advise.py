@@ -48,7 +48,7 @@ def advise(
     from rich.console import Console
 
     from uavmec_jax.reporting.advice import advice_data, advice_lines, advice_tables
-    from uavmec_jax.studies.scene import advise_at, load_scene
+    from uavmec_jax.scenarios.advice import advise_at, load_scene
 
     scene = load_scene(
         layout,

@@ -9,10 +9,10 @@ import click
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 def doctor(as_json: bool) -> None:
     """Say versions, devices and memory, and check the speed for two seconds."""
-    from uavmec_jax.studies import host
+    from uavmec_jax.training import host
 
     host.use_every_core()
-    from uavmec_jax.studies.speed import environment_speed
+    from uavmec_jax.runs.speed import environment_speed
 
     facts = host.describe() | {"environment_steps_per_second": round(environment_speed(seconds=2.0))}
     facts["versions"]["libsumo"] = host.version("libsumo")

@@ -97,14 +97,14 @@ def conclude(results: Any, directory: Path, console: Any, as_json: bool) -> None
 @click.option("--json", "as_json", is_flag=True, help="Print the cells as JSON on standard output.")
 def resume(directory: Path, workers: int | None, other_code: bool, as_json: bool) -> None:
     """Go on with the run in DIRECTORY, which was stopped or killed, and end as if nothing had happened."""
-    from uavmec_jax.studies import host
+    from uavmec_jax.training import host
 
     host.use_every_core()
     from rich.console import Console
 
     from uavmec_jax.reporting.progress import progress_bar
-    from uavmec_jax.studies.durable.folder import RunFolder
-    from uavmec_jax.studies.run import resume_run
+    from uavmec_jax.runs.folder import RunFolder
+    from uavmec_jax.runs.run import resume_run
 
     console = Console(stderr=as_json)
     plan = RunFolder.open(directory).plan
@@ -124,7 +124,7 @@ def status(directory: Path, as_json: bool) -> None:
     from rich.console import Console
 
     from uavmec_jax.reporting.status import status_lines
-    from uavmec_jax.studies.durable.status import run_status
+    from uavmec_jax.runs.status import run_status
 
     found = run_status(directory)
     if as_json:
@@ -142,13 +142,13 @@ def status(directory: Path, as_json: bool) -> None:
 )
 def worker(directory: Path, share: str | None, no_wait: bool) -> None:
     """Work on the run in DIRECTORY beside others, on this machine or on any that shares the folder."""
-    from uavmec_jax.studies import host
+    from uavmec_jax.training import host
 
     host.use_every_core(_share(share))
     from rich.console import Console
 
-    from uavmec_jax.studies.durable.stopping import Stopped
-    from uavmec_jax.studies.shared_run import work_on
+    from uavmec_jax.runs.shared_run import work_on
+    from uavmec_jax.runs.signals import Stopped
 
     try:
         complete = work_on(directory, wait=not no_wait, on_event=teller(Console()))
@@ -196,12 +196,12 @@ def submit(
     **durability: Any,
 ) -> None:
     """Plan STUDY and submit workers for it to a cluster (SLURM) by submitit: pip install 'uavmec-jax[cluster]'."""
-    from uavmec_jax.studies import host
+    from uavmec_jax.training import host
 
     host.use_every_core()
-    from uavmec_jax.studies.durable.cluster import submit_workers
-    from uavmec_jax.studies.durable.folder import Durability
-    from uavmec_jax.studies.shared_run import prepare_run
+    from uavmec_jax.runs.cluster import submit_workers
+    from uavmec_jax.runs.folder import Durability
+    from uavmec_jax.runs.shared_run import prepare_run
     from uavmec_jax.studies.study import load_study
 
     resolved = load_study(study, dict(assignment(setting) for setting in settings))
@@ -235,8 +235,8 @@ def tell_simulation(
     as_json: bool,
 ) -> None:
     """What a run would take, for a given speed."""
-    from uavmec_jax.studies.plan import plan_study
-    from uavmec_jax.studies.simulate import simulate
+    from uavmec_jax.runs.run_plan import plan_study
+    from uavmec_jax.runs.simulate import simulate
 
     if speed is None:
         fail("--simulate needs --speed, the training steps per second of one device; `uavmec doctor` measures it")

@@ -36,15 +36,15 @@ def plan(
     town = town_of(scenario, powered, connected, place)
     if not 1 <= width <= 100_000:
         fail(f"--width is {width}; give 1 to 100000 states")
-    from uavmec_jax.studies import host
+    from uavmec_jax.training import host
 
     host.use_every_core()
     from rich.console import Console
 
-    from uavmec_jax.planning.outlook import look_ahead
-    from uavmec_jax.reporting.outlook import outlook_data, outlook_summary, outlook_tables, save_outlook
-    from uavmec_jax.studies.archive import check_directory
-    from uavmec_jax.studies.scenario import load_scenario
+    from uavmec_jax.planning.plan import look_ahead
+    from uavmec_jax.reporting.plan import outlook_data, outlook_summary, outlook_tables, save_outlook
+    from uavmec_jax.runs.results_folder import check_directory
+    from uavmec_jax.scenarios.load import load_scenario
 
     inventory, keys = load_scenario(
         scenario,
@@ -104,9 +104,9 @@ def evaluate(
     from rich.console import Console
 
     from uavmec_jax.reporting.compare import evaluation_table
-    from uavmec_jax.studies.policies import TrainedPolicy, draws_scenarios, load_policy
-    from uavmec_jax.studies.scenario import evaluate as judge
-    from uavmec_jax.studies.scenario import load_scenario
+    from uavmec_jax.scenarios.load import load_scenario
+    from uavmec_jax.scenarios.policies import TrainedPolicy, draws_scenarios, load_policy
+    from uavmec_jax.studies.policy_evaluation import evaluate as judge
 
     axes = dict(assignment(setting, "--agent") for setting in agent)
     here = town | {"seed": seed} | ({"place": place} if place else {})

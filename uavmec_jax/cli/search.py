@@ -21,7 +21,7 @@ def search(space: str, trials: int | None, out: Path | None, no_confirm: bool, a
 
     Given the folder of a search that was stopped with --out, goes on with it.
     """
-    from uavmec_jax.studies import host
+    from uavmec_jax.training import host
 
     host.use_every_core()
     from rich.console import Console
@@ -29,9 +29,9 @@ def search(space: str, trials: int | None, out: Path | None, no_confirm: bool, a
     from uavmec_jax.reporting import canvas
     from uavmec_jax.reporting.compare import comparison
     from uavmec_jax.reporting.search import history_figure, importance_figure, search_json, search_tables
-    from uavmec_jax.studies.search import search as searching
-    from uavmec_jax.studies.search.confirm import confirm
-    from uavmec_jax.studies.search.space import load_space
+    from uavmec_jax.search import search as searching
+    from uavmec_jax.search.confirm import confirm
+    from uavmec_jax.search.space import load_space
 
     wanted = load_space(space, {"trials": trials} if trials else None)
     directory, console = out or new_folder(wanted.name), Console(stderr=as_json)

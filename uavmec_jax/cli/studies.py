@@ -50,16 +50,16 @@ def run(
     """Train and judge STUDY: a study that ships with the package (table5, table6, table7, planning, ...) or a TOML file."""
     overrides = _overrides(quick, seeds, steps, settings)
 
-    from uavmec_jax.studies import host
+    from uavmec_jax.training import host
 
     host.use_every_core()
     from rich.console import Console
 
     from uavmec_jax.reporting.progress import progress_bar
-    from uavmec_jax.studies.archive import check_directory
-    from uavmec_jax.studies.durable.folder import Durability
-    from uavmec_jax.studies.plan import plan_study
-    from uavmec_jax.studies.run import run_study
+    from uavmec_jax.runs.folder import Durability
+    from uavmec_jax.runs.results_folder import check_directory
+    from uavmec_jax.runs.run import run_study
+    from uavmec_jax.runs.run_plan import plan_study
     from uavmec_jax.studies.study import load_study
 
     console = Console(stderr=as_json)
@@ -106,7 +106,7 @@ def show(directory: Path, as_json: bool) -> None:
     """Print the tables of the run in DIRECTORY again."""
     from rich.console import Console
 
-    from uavmec_jax.studies.archive import load_results
+    from uavmec_jax.runs.results_folder import load_results
 
     results = load_results(directory)
     print_results(results, directory, Console(stderr=as_json), as_json)
@@ -133,7 +133,7 @@ def compare(
     from rich.console import Console
 
     from uavmec_jax.reporting.compare import comparison
-    from uavmec_jax.studies.archive import load_results
+    from uavmec_jax.runs.results_folder import load_results
     from uavmec_jax.studies.compare import Side
 
     a = Side(load_results(run_a), policy_a, dict(assignment(one, "--a") for one in where_a))
@@ -151,7 +151,8 @@ def compare(
 def validate(file: str, as_json: bool) -> None:
     """Check the study FILE (or a shipped study) without running it."""
     from uavmec_jax.studies.places import load_evacuations
-    from uavmec_jax.studies.study import load_study, n_agents
+    from uavmec_jax.studies.population import n_agents
+    from uavmec_jax.studies.study import load_study
 
     study = load_study(file)
     load_evacuations(study)

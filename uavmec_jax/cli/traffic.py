@@ -117,8 +117,8 @@ def show(
         written.append(figure)
     if animation is not None:
         from uavmec_jax.reporting.animation import save_animation
-        from uavmec_jax.studies.policies import load_policy
-        from uavmec_jax.studies.scenario import load_scenario
+        from uavmec_jax.scenarios.load import load_scenario
+        from uavmec_jax.scenarios.policies import load_policy
 
         chosen = load_policy(policy)
         inventory, keys = load_scenario(None, place=source, powered=powered, connected=connected, seed=seed)
@@ -158,7 +158,7 @@ def _changes(
 ) -> dict[str, Any]:
     """What the options change about a place, as tables of its file."""
     from uavmec_jax.errors import TrafficError
-    from uavmec_jax.files import parse_toml, read_text
+    from uavmec_jax.files.reading import parse_toml, read_text
 
     demand = {"origins": origins or None, "exits": dict(map(_exit, exits)) or None, "vehicles": vehicles}
     given: dict[str, dict[str, Any]] = {"demand": demand, "simulation": {"seeds": seeds}}

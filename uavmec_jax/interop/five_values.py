@@ -6,8 +6,9 @@ import jax
 from flax import struct
 from jaxtyping import Array, PRNGKeyArray
 
-from uavmec_jax.world.environment import Scenario, UavMecEnv, make_scenario
-from uavmec_jax.world.physics import State
+from uavmec_jax.env.dynamics import State
+from uavmec_jax.env.environment import UavMecEnv
+from uavmec_jax.env.scenario import Scenario, make_scenario
 
 
 @struct.dataclass

@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from uavmec_jax.world.environment import Scenario, advance, draw_volumes, is_truncated, make_scenario, observe
-from uavmec_jax.world.physics import Cause, State, initial_state
+from uavmec_jax.env.dynamics import Cause, State, initial_state
+from uavmec_jax.env.observation import observe
+from uavmec_jax.env.scenario import Scenario, advance, draw_volumes, is_truncated, make_scenario
 
 
 def spaces(scenario: Scenario) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Discrete]:

@@ -10,11 +10,12 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from uavmec_jax.env.dynamics import Cause, State
+from uavmec_jax.env.environment import UavMecEnv
+from uavmec_jax.env.layout import sample_layout
+from uavmec_jax.env.params import Params
+from uavmec_jax.env.scenario import Scenario, make_scenario
 from uavmec_jax.interop.gymnasium_env import spaces
-from uavmec_jax.world.environment import Scenario, UavMecEnv, make_scenario
-from uavmec_jax.world.layout import sample_layout
-from uavmec_jax.world.params import Params
-from uavmec_jax.world.physics import Cause, State
 
 _CAUSES = np.array([cause.name.lower() for cause in Cause])
 

@@ -1,7 +1,7 @@
 """Advice for the next slot: whom to visit, how long the network will last, and which device will fail first.
 
 Whatever policy is asked, every device is tried as the next visit, and many futures are played to their end with the policy
-going on. It is the rollout planner's step (:mod:`uavmec_jax.planning.lookahead`) with so many futures that their
+going on. It is the rollout planner's step (:mod:`uavmec_jax.planning.rollout_planner`) with so many futures that their
 distribution is worth showing.
 """
 
@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key
 
+from uavmec_jax.env.dynamics import Cause, State, initial_state
+from uavmec_jax.env.layout import Layout
+from uavmec_jax.env.params import Params
+from uavmec_jax.env.rollout import Episode, Policy, play_on
 from uavmec_jax.planning.changes import WhatIf, every_change, rank_changes
-from uavmec_jax.world.layout import Layout
-from uavmec_jax.world.params import Params
-from uavmec_jax.world.physics import Cause, State, initial_state
-from uavmec_jax.world.rollout import Episode, Policy, play_on
 
 SAMPLES = 256
 """Futures played for each device that could be visited next."""

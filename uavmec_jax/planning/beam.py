@@ -18,11 +18,11 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, Num
 
+from uavmec_jax.env.dynamics import Cause, Outcome, State, initial_state, slots_to_expiry, transition
+from uavmec_jax.env.layout import Layout
+from uavmec_jax.env.params import Params
 from uavmec_jax.planning import demand
 from uavmec_jax.planning.demand import SlotCosts
-from uavmec_jax.world.layout import Layout
-from uavmec_jax.world.params import Params
-from uavmec_jax.world.physics import Cause, Outcome, State, initial_state, slots_to_expiry, transition
 
 WIDTH = 64
 """States kept per slot by default. Four times as many lengthen one life in 400 by a slot."""

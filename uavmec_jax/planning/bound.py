@@ -21,12 +21,12 @@ import numpy as np
 from jaxtyping import Array, Int, Num
 from scipy.optimize import linprog
 
+from uavmec_jax.env.dynamics import slots_to_expiry
+from uavmec_jax.env.layout import Layout
+from uavmec_jax.env.params import Params
 from uavmec_jax.planning import demand
 from uavmec_jax.planning.beam import counting_bound
 from uavmec_jax.planning.flight import Rounds
-from uavmec_jax.world.layout import Layout
-from uavmec_jax.world.params import Params
-from uavmec_jax.world.physics import slots_to_expiry
 
 _SLACK = 1e-5
 """Relative allowance for the single precision of the slot's physics; in favour of the network."""

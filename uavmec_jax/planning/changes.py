@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from uavmec_jax.world.layout import Layout
+from uavmec_jax.env.layout import Layout
 
 CHANGES = ("repair power", "repair comms", "remove")
 

@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from uavmec_jax.env.dynamics import State, slots_to_expiry
+from uavmec_jax.env.layout import Layout
+from uavmec_jax.env.params import Params
 from uavmec_jax.planning import demand
 from uavmec_jax.planning.demand import SlotCosts
-from uavmec_jax.world.layout import Layout
-from uavmec_jax.world.params import Params
-from uavmec_jax.world.physics import State, slots_to_expiry
 
 LOOKAHEAD = 64
 """Slots that the rule looks ahead at most; at the paper's settings the UAV's battery lasts 33."""

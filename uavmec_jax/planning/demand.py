@@ -11,9 +11,9 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, Num
 
-from uavmec_jax.world.layout import Layout
-from uavmec_jax.world.params import Params
-from uavmec_jax.world.physics import slots_to_expiry, upload_rate
+from uavmec_jax.env.dynamics import slots_to_expiry, upload_rate
+from uavmec_jax.env.layout import Layout
+from uavmec_jax.env.params import Params
 
 _ROUNDING = 1e-5
 """Relative allowance for single precision, always given in favour of the network."""

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from uavmec_jax.env.dynamics import Cause, Outcome, State, initial_state
+from uavmec_jax.env.layout import Layout
+from uavmec_jax.env.params import Params
 from uavmec_jax.planning.beam import Tour, visit_all
-from uavmec_jax.world.layout import Layout
-from uavmec_jax.world.params import Params
-from uavmec_jax.world.physics import Cause, Outcome, State, initial_state
 
 MOST_STATES = 20_000
 

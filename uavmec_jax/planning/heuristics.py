@@ -11,13 +11,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PRNGKeyArray
 
+from uavmec_jax.env.dynamics import State, slots_to_expiry
+from uavmec_jax.env.layout import Layout
+from uavmec_jax.env.params import Params
+from uavmec_jax.env.rollout import Policy
 from uavmec_jax.planning import demand
 from uavmec_jax.planning.deadlines import earliest_deadline
-from uavmec_jax.planning.tour import shortest_tour
-from uavmec_jax.world.layout import Layout
-from uavmec_jax.world.params import Params
-from uavmec_jax.world.physics import State, slots_to_expiry
-from uavmec_jax.world.rollout import Policy
+from uavmec_jax.planning.shortest_tour import shortest_tour
 
 
 def stay_put(params: Params, layout: Layout, state: State, key: PRNGKeyArray | None = None) -> Array:

@@ -1,6 +1,6 @@
 """The full observation: what a UAV can know about every device before a slot's task volumes are known.
 
-The paper's observation (:func:`uavmec_jax.world.environment.observe`) holds batteries and ages alone, so that a policy on it
+The paper's observation (:func:`uavmec_jax.env.environment.observe`) holds batteries and ages alone, so that a policy on it
 is made for one layout. This one also says where, what and how much for every device, so that one policy can serve any
 layout. All of it follows from the parameters, the layout, the state and the *expected* task volumes; nothing of the slot
 to come is in it.
@@ -12,11 +12,11 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
+from uavmec_jax.env.dynamics import State, slots_to_expiry
+from uavmec_jax.env.fixed_point import sum_in_any_order
+from uavmec_jax.env.layout import Layout
+from uavmec_jax.env.params import Params
 from uavmec_jax.planning import deadlines, demand
-from uavmec_jax.world.exact import sum_in_any_order
-from uavmec_jax.world.layout import Layout
-from uavmec_jax.world.params import Params
-from uavmec_jax.world.physics import State, slots_to_expiry
 
 _LONG = 32.0
 """Slots by which lives are scaled: about what the UAV's battery lasts at the paper's settings."""

@@ -10,14 +10,14 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Key
 
+from uavmec_jax.env.layout import Layout
+from uavmec_jax.env.params import Params
+from uavmec_jax.env.rollout import Episode, Policy, recorded, rollout, rollouts, tour_policy, volume_table
 from uavmec_jax.planning.beam import Appraisal, beam_search
 from uavmec_jax.planning.bound import upper_bounds
 from uavmec_jax.planning.deadlines import earliest_deadline
 from uavmec_jax.planning.heuristics import HEURISTICS
-from uavmec_jax.planning.lookahead import rollout_planner
-from uavmec_jax.world.layout import Layout
-from uavmec_jax.world.params import Params
-from uavmec_jax.world.rollout import Episode, Policy, recorded, rollout, rollouts, tour_policy, volume_table
+from uavmec_jax.planning.rollout_planner import rollout_planner
 
 _CPU_BATCH = 64
 """Scenarios that a CPU core plays a policy on at once: enough for its matrix products, few enough for its cache."""

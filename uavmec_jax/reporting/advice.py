@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from uavmec_jax.env.dynamics import Cause
 from uavmec_jax.planning.advice import Advice
-from uavmec_jax.reporting.outlook import called, change_table
-from uavmec_jax.world.physics import Cause
+from uavmec_jax.reporting.plan import called, change_table
 
 SHOWN = 5
 """Lines of each table on the terminal; ``--json`` has all."""

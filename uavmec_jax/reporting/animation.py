@@ -9,13 +9,13 @@ from matplotlib.animation import PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from uavmec_jax.files import whole
+from uavmec_jax.env.layout import Layout
+from uavmec_jax.env.params import Params
+from uavmec_jax.env.rollout import Policy, Trace, trace
+from uavmec_jax.files.writing import whole
 from uavmec_jax.reporting.canvas import new_figure
 from uavmec_jax.reporting.road_map import density_key, draw_roads, draw_sites, frame
 from uavmec_jax.traffic.evacuation import Evacuation
-from uavmec_jax.world.layout import Layout
-from uavmec_jax.world.params import Params
-from uavmec_jax.world.rollout import Policy, Trace, trace
 
 MOST_SLOTS = 120
 """Longest episode that is drawn."""

@@ -5,7 +5,7 @@ from pathlib import Path
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from uavmec_jax.files import whole
+from uavmec_jax.files.writing import whole
 
 
 def save(figure: Figure, path: Path) -> None:

@@ -7,7 +7,7 @@ import pandas as pd
 from rich.table import Table
 from rich.text import Text
 
-from uavmec_jax.reporting.words import first_to_fail, half_interval, place
+from uavmec_jax.reporting.formatting import first_to_fail, half_interval, place
 from uavmec_jax.studies.compare import Side, differences, overall, pair
 
 _MEASURES = {
@@ -63,7 +63,7 @@ def _whole(whole: dict[str, tuple[float, float, float]]) -> Table:
 
 
 def evaluation_table(rows: list[dict[str, Any]]) -> Table:
-    """One line per policy on one scenario, from :func:`uavmec_jax.studies.scenario.evaluate`."""
+    """One line per policy on one scenario, from :func:`uavmec_jax.scenarios.load.evaluate`."""
     table = Table()
     for name in ("policy", "lifetime, slots", "shortest", "longest", "ends by", "first to fail"):
         table.add_column(name, justify="left" if name == "policy" else "right")

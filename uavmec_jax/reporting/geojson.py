@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from uavmec_jax.planning.outlook import Outlook
-from uavmec_jax.world.inventory import Inventory
+from uavmec_jax.planning.plan import Outlook
+from uavmec_jax.scenarios.named_scenario import Inventory
 
 
 def plan_geojson(inventory: Inventory, outlook: Outlook) -> dict[str, Any]:

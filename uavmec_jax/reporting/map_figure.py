@@ -5,9 +5,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from uavmec_jax.world.environment import Scenario
-from uavmec_jax.world.layout import Layout
-from uavmec_jax.world.physics import State
+from uavmec_jax.env.dynamics import State
+from uavmec_jax.env.layout import Layout
+from uavmec_jax.env.scenario import Scenario
 
 _COLOURS = {
     (True, True): "tab:green",

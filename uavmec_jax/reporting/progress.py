@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from uavmec_jax.learning.population import Progress as News
-from uavmec_jax.studies.plan import Plan
+from uavmec_jax.runs.run_plan import Plan
+from uavmec_jax.training.population import Progress as News
 
 
 @contextmanager

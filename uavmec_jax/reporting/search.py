@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from uavmec_jax.reporting.canvas import new_figure
-from uavmec_jax.studies.search.search import Found
-from uavmec_jax.studies.search.space import own_settings
+from uavmec_jax.search.search import Found
+from uavmec_jax.search.space import own_settings
 
 _SHOWN = 4
 """Trials in the table."""

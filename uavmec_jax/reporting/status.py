@@ -2,7 +2,7 @@
 
 import datetime
 
-from uavmec_jax.studies.durable.status import Status
+from uavmec_jax.runs.status import Status
 
 _MOST = 8
 """Workers and failures that are named."""

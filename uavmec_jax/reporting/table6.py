@@ -7,7 +7,7 @@ import pandas as pd
 from rich.table import Table
 from rich.text import Text
 
-from uavmec_jax.reporting.words import half_interval
+from uavmec_jax.reporting.formatting import half_interval
 from uavmec_jax.studies.paper import TABLE6
 from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.schema import PLANNERS

@@ -6,12 +6,12 @@ import pandas as pd
 from rich.table import Table
 from rich.text import Text
 
-from uavmec_jax.reporting.words import half_interval, place
+from uavmec_jax.reporting.formatting import half_interval, place
 from uavmec_jax.studies.first_failures import LEARNED, first_failure_groups, traffic_claims, with_traffic
 from uavmec_jax.studies.paper import TABLE7
+from uavmec_jax.studies.population import cell_axes
 from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.schema import PLANNERS, TRAFFIC_WEIGHTS
-from uavmec_jax.studies.study import cell_axes
 
 _SHORT = {
     "oldest_first": "oldest",

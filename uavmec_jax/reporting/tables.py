@@ -6,13 +6,13 @@ import pandas as pd
 from rich.table import Table
 from rich.text import Text
 
+from uavmec_jax.reporting.formatting import first_to_fail, half_interval, place
 from uavmec_jax.reporting.table6 import is_table6, table6_tables
 from uavmec_jax.reporting.table7 import table7_tables
-from uavmec_jax.reporting.words import first_to_fail, half_interval, place
 from uavmec_jax.studies.first_failures import has_places
 from uavmec_jax.studies.paper import TABLE5
+from uavmec_jax.studies.population import cell_axes
 from uavmec_jax.studies.results import Results
-from uavmec_jax.studies.study import cell_axes
 
 NOTICEABLE_SLOTS = 0.5
 """Differences from the paper below this many slots are not coloured: the paper rounds, and averages few seeds."""

@@ -13,9 +13,9 @@ import pandas as pd
 from scipy import stats
 
 from uavmec_jax.errors import StudyError
+from uavmec_jax.studies.population import cell_axes
 from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.statistics import CONFIDENCE, mean_interval
-from uavmec_jax.studies.study import cell_axes
 
 _RESAMPLES = 2000
 

@@ -7,18 +7,21 @@ from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 from jaxtyping import Array, Key
 
-from uavmec_jax.learning.algorithm import Agent, Algorithm
+from uavmec_jax.agents.algorithm import Agent, Algorithm
+from uavmec_jax.env.dynamics import Cause
+from uavmec_jax.env.generator import ScenarioDistribution, scenario_of_draw
+from uavmec_jax.env.layout import Layout
+from uavmec_jax.env.params import Params
+from uavmec_jax.env.rollout import Episode, play_draws
+from uavmec_jax.env.scenario import Scenario
 from uavmec_jax.planning.beam import horizon
 from uavmec_jax.planning.parallel import bound_all, play_beam, play_heuristics, play_rollout
-from uavmec_jax.studies.drawn import one_by_one
 from uavmec_jax.studies.schema import Evaluation
-from uavmec_jax.world.distribution import ScenarioDistribution, play_draws
-from uavmec_jax.world.physics import Cause
-from uavmec_jax.world.rollout import Episode
 
 
 @dataclass(frozen=True)
@@ -259,3 +262,23 @@ def _play_learned(algorithm: Algorithm, agents: Agent, keys: Key[Array, "A D"], 
         return play_draws(algorithm.policy(agent.hyper, weights), agent.scenario, draws)
 
     return jax.vmap(one)(agents, keys, weights)
+
+
+def one_by_one(
+    plays: Scenario | ScenarioDistribution, keys: Key[Array, "A D"]
+) -> tuple[Params, Layout, Key[Array, " AD"]]:
+    """What ``A`` agents play in each of ``D`` draws, and the draws, leaves ``[A * D, ...]``.
+
+    Args:
+        plays: leaves ``[A, ...]``.
+        keys: draws.
+    """
+    if isinstance(plays, Scenario):
+        each = jax.tree.map(lambda leaf: jnp.repeat(leaf, keys.shape[1], axis=0), plays)
+    else:
+        drawn = _draw_all(plays, keys)
+        each = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), drawn)
+    return each.params, each.layout, keys.reshape(-1)
+
+
+_draw_all = jax.jit(jax.vmap(jax.vmap(scenario_of_draw, (None, 0))))

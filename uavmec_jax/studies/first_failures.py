@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from uavmec_jax.studies.population import cell_axes
 from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.schema import PLANNERS, TRAFFIC_WEIGHTS, Study
 from uavmec_jax.studies.statistics import mean_interval, sign_test
-from uavmec_jax.studies.study import cell_axes
 
 ALL_PLACES = "all places"
 LEARNED = ("best", "last")

@@ -7,10 +7,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from uavmec_jax.env.layout import Layout, Traffic
 from uavmec_jax.errors import StudyError
+from uavmec_jax.scenarios.places import _weights
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.traffic.evacuation import Evacuation, load_evacuation
-from uavmec_jax.world.layout import Layout, Traffic
 
 
 def places_of(study: Study) -> tuple[str, ...]:
@@ -40,26 +41,6 @@ def load_evacuations(study: Study) -> dict[str, Evacuation]:
     return found
 
 
-def on_place(
-    layout: Layout, evacuation: Evacuation, *, moving: bool = False, scale_to_m: float | None = None
-) -> Layout:
-    """A layout with its devices where those of an evacuation stand.
-
-    Args:
-        layout: hardware, batteries, power and communication of ``n`` devices.
-        evacuation: of ``n`` devices.
-        moving: their weights follow the evacuation's windows; by default they are its mean, as in the paper.
-        scale_to_m: see :meth:`Evacuation.local_position`.
-    """
-    traffic = Traffic(
-        weight=jnp.asarray(_weights(evacuation, moving)),
-        window_s=jnp.float32(evacuation.meta["window_s"]),
-        price=jnp.float32(0),
-    )
-    position = jnp.asarray(evacuation.local_position(scale_to_m), jnp.float32)
-    return replace(layout, position=position, traffic=traffic)
-
-
 def onto_places(layouts: Layout, agents: Sequence[Mapping[str, Any]], study: Study) -> Layout:
     """Layouts ``[A, ...]`` of agents with their devices in the places of the study; unchanged if it has none.
 
@@ -80,11 +61,6 @@ def onto_places(layouts: Layout, agents: Sequence[Mapping[str, Any]], study: Stu
     )
     position = np.stack([evacuation.local_position(study.place_scale_m) for evacuation in own])
     return replace(layouts, position=jnp.asarray(position, jnp.float32), traffic=traffic)
-
-
-def _weights(evacuation: Evacuation, moving: bool) -> np.ndarray:
-    """``[W, n]``: the weights of every window, or their mean alone."""
-    return evacuation.window_weight if moving else evacuation.weight[None]
 
 
 def describe_places(study: Study) -> dict[str, dict[str, Any]]:

@@ -1,11 +1,10 @@
 """What a run leaves: files that are read back without pickle, each written whole or not at all."""
 
-import datetime
 import hashlib
 import json
-import sys
+import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,22 +12,19 @@ import numpy as np
 import pandas as pd
 from flax import traverse_util
 
-from uavmec_jax.files import write_arrays, write_text
-from uavmec_jax.studies import host
-from uavmec_jax.studies.collection import WEIGHTS, Collection, write_collection
-from uavmec_jax.studies.durable.folder import RUN, STUDY
+from uavmec_jax.files.writing import write_arrays, write_text
+from uavmec_jax.scenarios.policy_files import WEIGHTS, Collection, write_collection
 from uavmec_jax.studies.evaluation import device_number
-from uavmec_jax.studies.places import describe_places
-from uavmec_jax.studies.plan import Plan
+from uavmec_jax.studies.population import cell_axes
 from uavmec_jax.studies.schema import PLANNERS, Study
-from uavmec_jax.studies.shard import Finished
+from uavmec_jax.studies.shard_result import Finished
 from uavmec_jax.studies.statistics import mean_interval
-from uavmec_jax.studies.study import cell_axes, seeds_of, study_toml
+from uavmec_jax.studies.study import study_toml
 
 SCHEMA = 2
 """Version of the run folder. In version 1 curves and weights did not name their algorithm: it was the DQN."""
 
-AGENTS, CURVES, EVALUATION = "agents.csv", "curves.npz", "evaluation.npz"
+STUDY, RUN, AGENTS, CURVES, EVALUATION = "study.toml", "run.json", "agents.csv", "curves.npz", "evaluation.npz"
 
 
 @dataclass
@@ -215,7 +211,7 @@ class Results:
         for row in json.loads(axes.to_json(orient="records", double_precision=15)):
             agents[row.get("algorithm", self.study.algorithm)].append(row)
         finished = {name: own for name, own in agents.items() if own}
-        return Collection.of_study(self.study, finished, self.weights)
+        return policy_collection(self.study, finished, self.weights)
 
 
 def _joined(pieces: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
@@ -232,18 +228,23 @@ def _first_to_fail(policy: str, share: np.ndarray) -> dict[str, Any]:
     return {f"{policy}_first_device": device_number(share), f"{policy}_first_share": float(share.max())}
 
 
-def label_of(study: Study, plan: Plan, command: str | None) -> dict[str, Any]:
-    """What is known of a run before it starts, for ``run.json``."""
-    return {
-        "schema": SCHEMA,
-        "study": study.name,
-        "command": command or " ".join(sys.argv),
-        "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "complete": False,
-        "agents": plan.agents,
-        "seeds": seeds_of(study),
-        **({"places": places} if (places := describe_places(study)) else {}),
-        "workers": plan.workers,
-        "blocks": {name: asdict(blocks) for name, blocks in plan.blocks.items()},
-        **host.describe(),
-    }
+def _drawn(study: Study) -> dict[str, Any]:
+    """What scenarios were drawn from, as plain data; infinite numbers, which JSON has no word for, are left out."""
+    if study.scenarios is None:
+        return {}
+    params = {name: value for name, value in study.params.model_dump().items() if value != math.inf}
+    return {"scenarios": study.scenarios.model_dump(mode="json"), "params": params}
+
+
+def policy_collection(
+    study: Study, agents: Mapping[str, list[dict[str, Any]]], weights: Mapping[str, Any]
+) -> Collection:
+    """Agents of a study as a collection of policies, ``weights`` by algorithm and kind: nested, or flat with ``/``."""
+    place = {"place": study.place} if study.place else {}
+    return Collection(
+        settings={name: getattr(study, name).model_dump(mode="json") for name in agents},
+        n_devices=study.params.n_devices,
+        agents={name: [dict(who) | place for who in own] for name, own in agents.items()},
+        weights=traverse_util.flatten_dict(dict(weights), sep="/"),
+        drawn=_drawn(study),
+    )

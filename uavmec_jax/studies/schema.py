@@ -11,13 +11,14 @@ from typing import Annotated, Any, Literal, get_args
 import pydantic
 from pydantic import Field
 
-from uavmec_jax.learning.registry import ALGORITHMS, OF_THE_SCENARIO
+from uavmec_jax.agents.registry import ALGORITHMS, OF_THE_SCENARIO
+from uavmec_jax.env.params import Params
+from uavmec_jax.env.rewards import DEFAULT_REWARD, LOG_GUARDS, REWARDS, TERMS
+from uavmec_jax.files.validation import Strict, nearest, settings_model, wanted
 from uavmec_jax.planning.beam import WIDTH as BEAM_WIDTH
-from uavmec_jax.planning.lookahead import SAMPLES as ROLLOUT_SAMPLES
-from uavmec_jax.studies.drawn import ScenarioSettings, check_scenarios
-from uavmec_jax.world.params import Params
-from uavmec_jax.world.rewards import DEFAULT_REWARD, LOG_GUARDS, REWARDS, TERMS
-from uavmec_jax.world.settings import ParamsSettings, Strict, check_ranges, nearest, settings_model, wanted
+from uavmec_jax.planning.rollout_planner import SAMPLES as ROLLOUT_SAMPLES
+from uavmec_jax.scenarios.distribution import ScenarioSettings, check_scenarios
+from uavmec_jax.scenarios.settings import ParamsSettings, check_ranges
 
 
 def _algorithm_settings(name: str) -> Any:

@@ -13,7 +13,7 @@ from uavmec_jax.traffic.network import build_network
 from uavmec_jax.traffic.place import Place
 from uavmec_jax.traffic.simulation import simulate
 from uavmec_jax.traffic.weights import density_near, scaled
-from uavmec_jax.traffic.workshop import Workshop
+from uavmec_jax.traffic.workspace import Workshop
 
 
 def build_evacuation(

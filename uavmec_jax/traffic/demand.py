@@ -7,9 +7,9 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from uavmec_jax.errors import TrafficError
+from uavmec_jax.files.validation import nearest
 from uavmec_jax.traffic.network import HIGHWAYS, RESIDENTIAL, Road, RoadNetwork
 from uavmec_jax.traffic.place import Demand
-from uavmec_jax.world.settings import nearest
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,11 @@
 import numpy as np
 
 from uavmec_jax.errors import TrafficError
+from uavmec_jax.files.validation import nearest
 from uavmec_jax.traffic.demand import Routes
 from uavmec_jax.traffic.network import RoadNetwork
 from uavmec_jax.traffic.place import Place, Placement, Site
 from uavmec_jax.traffic.weights import density_near
-from uavmec_jax.world.settings import nearest
 
 _CORRIDOR_QUANTILE = 0.8
 

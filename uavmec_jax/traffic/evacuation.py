@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from uavmec_jax.errors import TrafficError
-from uavmec_jax.files import read_checked, write_checked
+from uavmec_jax.files.archives import read_checked, write_checked
+from uavmec_jax.files.validation import nearest
 from uavmec_jax.traffic.place import PLACES, shipped_places
-from uavmec_jax.world.settings import nearest
 
 SCHEMA = 1
 """Version of the file."""

@@ -14,11 +14,11 @@ import numpy as np
 import platformdirs
 
 from uavmec_jax.errors import TrafficError
-from uavmec_jax.files import whole
+from uavmec_jax.files.writing import whole
 from uavmec_jax.traffic import sumo
+from uavmec_jax.traffic.checked_xml import Contents, checked_copy
 from uavmec_jax.traffic.place import NetworkSource
-from uavmec_jax.traffic.reading import Contents, checked_copy
-from uavmec_jax.traffic.workshop import Workshop
+from uavmec_jax.traffic.workspace import Workshop
 
 HIGHWAYS = ("motorway", "motorway_link", "trunk", "trunk_link", "primary")
 """Classes of roads whose ends are exits, unless the user names the exits."""

@@ -7,10 +7,10 @@ from typing import Annotated, Any
 import pydantic
 from pydantic import Field
 
+from uavmec_jax.env.params import MAX_DEVICES
 from uavmec_jax.errors import TrafficError
-from uavmec_jax.files import parse_toml, read_text
-from uavmec_jax.world.inventory import MOST_DEVICES
-from uavmec_jax.world.settings import Strict, nearest, one_line
+from uavmec_jax.files.reading import parse_toml, read_text
+from uavmec_jax.files.validation import Strict, nearest, one_line
 
 _Positive = Annotated[float, Field(gt=0, le=1e7)]
 _NotNegative = Annotated[float, Field(ge=0, le=1e7)]
@@ -129,7 +129,7 @@ class Site(Strict):
 class Placement(Strict):
     """Where devices go that no file places: junctions far from each other, some of them on the corridors."""
 
-    count: Annotated[int, Field(ge=2, le=MOST_DEVICES)] = 12
+    count: Annotated[int, Field(ge=2, le=MAX_DEVICES)] = 12
     corridor_share: Annotated[float, Field(ge=0, le=1)] = 0.5
     """Share of the devices among the fifth of the junctions with the densest traffic; the others are off them."""
     span_m: _Positive = 1500.0
@@ -152,8 +152,8 @@ class Place(Strict):
     @pydantic.model_validator(mode="after")
     def _check(self) -> "Place":
         names = [site.name for site in self.device]
-        if self.device and not 2 <= len(names) <= MOST_DEVICES:
-            raise ValueError(f"holds {len(names)} [[device]] tables; give 2 to {MOST_DEVICES}, or none")
+        if self.device and not 2 <= len(names) <= MAX_DEVICES:
+            raise ValueError(f"holds {len(names)} [[device]] tables; give 2 to {MAX_DEVICES}, or none")
         for name in names:
             if names.count(name) > 1:
                 raise ValueError(f"device name {name!r} is given twice; names must differ")

@@ -15,7 +15,7 @@ from uavmec_jax.traffic import sumo
 from uavmec_jax.traffic.demand import Routes, write_trips
 from uavmec_jax.traffic.network import RoadNetwork
 from uavmec_jax.traffic.place import Demand, Simulation
-from uavmec_jax.traffic.workshop import Workshop
+from uavmec_jax.traffic.workspace import Workshop
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,108 @@
+"""The replay memory against a plain list of transitions."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy import stats
+
+from uavmec_jax.agents import replay
+from uavmec_jax.agents.replay import ReplaySpec
+
+GAMMA = 0.9
+
+
+def test_size_of_a_row_and_of_the_paper_grid():
+    assert ReplaySpec(n_devices=12, capacity=1_000_000, wraps=False).words == 16  # 64 bytes, one cache line
+    assert 75 * ReplaySpec(n_devices=12, capacity=1_000_000, wraps=False).bytes < 8 * 2**30
+
+
+def filled(spec, n, seed=0):
+    """Write ``n`` random transitions; returns the rows and the list of what went in (last: whether an episode ended)."""
+    rng = np.random.default_rng(seed)
+    d = spec.n_devices
+    first = np.concatenate([np.ones(d), np.zeros(d)]).astype(np.float32)
+    rows, stored, observation = replay.init(spec), [], first
+    for start in range(0, n, spec.stride):
+        new = []
+        for _ in range(spec.stride):
+            battery = rng.random(d, np.float32)
+            age = rng.integers(0, spec.max_age + 1, d).astype(np.int32)
+            action, reward = int(rng.integers(d)), np.float32(rng.normal())
+            terminated = bool(rng.random() < 0.2)
+            ended = terminated or bool(rng.random() < 0.1)
+            new.append(
+                replay.pack(
+                    spec, jnp.int32(action), jnp.float32(reward), jnp.asarray(battery), jnp.asarray(age),
+                    jnp.asarray(terminated), jnp.asarray(ended),
+                )
+            )  # fmt: skip
+            reached = np.concatenate([battery, age.astype(np.float32)])
+            stored.append((observation, action, reward, float(terminated), reached, ended))
+            observation = first if ended else reached
+        rows = replay.add(spec, rows, jnp.int32(start), jnp.stack(new))
+    return rows, stored
+
+
+@pytest.mark.parametrize(
+    ("n_devices", "capacity", "stride", "max_age", "written", "wraps"),
+    [
+        (12, 40, 4, 11, 40, False),
+        (12, 40, 4, 11, 24, False),
+        (12, 16, 4, 11, 100, True),
+        (3, 10, 1, 250, 37, True),
+        (64, 9, 5, 30, 60, True),
+    ],
+)
+def test_every_transition_comes_back_to_the_bit(n_devices, capacity, stride, max_age, written, wraps):
+    spec = ReplaySpec(n_devices, capacity, stride, max_age, wraps)
+    rows, stored = filled(spec, written)
+    size = min(written, capacity)
+    batch = replay.sample(spec, rows, jnp.int32(written), jnp.arange(size, dtype=jnp.uint32), GAMMA)
+    for i in range(size):  # word i draws the transition i back from the newest
+        observation, action, reward, terminated, reached, _ = stored[-1 - i]
+        assert_array_equal(batch.observation[i], observation)
+        assert_array_equal(batch.next_observation[i], reached)
+        assert (batch.action[i], batch.reward[i], batch.terminated[i]) == (action, reward, terminated)
+    assert_array_equal(batch.discount, np.float32(GAMMA))
+
+
+def test_sampling_is_uniform_and_with_replacement():
+    spec = ReplaySpec(n_devices=2, capacity=50, stride=1, wraps=True)
+    rows, _ = filled(spec, 70)
+    # the reward identifies the transition
+    bits = jax.random.bits(jax.random.key(0), (20_000,))
+    rewards = np.asarray(replay.sample(spec, rows, jnp.int32(70), bits, GAMMA).reward)
+    values, counts = np.unique(rewards, return_counts=True)
+    assert len(values) == 50
+    assert stats.chisquare(counts).pvalue > 1e-3
+    few = np.asarray(replay.sample(spec, rows, jnp.int32(70), bits[:40], GAMMA).reward)
+    assert len(np.unique(few)) < 40  # 40 of 50 without replacement would all differ
+
+
+def test_only_what_was_written_is_drawn():
+    spec = ReplaySpec(n_devices=2, capacity=1000, stride=1, wraps=False)
+    rows, stored = filled(spec, 5)
+    drawn = replay.sample(spec, rows, jnp.int32(5), jax.random.bits(jax.random.key(0), (500,)), GAMMA)
+    assert set(np.asarray(drawn.reward).tolist()) == {float(reward) for _, _, reward, *_ in stored}
+
+
+@pytest.mark.parametrize(("capacity", "written", "wraps"), [(40, 40, False), (16, 100, True)])
+def test_n_step_returns(capacity, written, wraps):
+    spec = ReplaySpec(3, capacity, wraps=wraps, n_step=3)
+    rows, stored = filled(spec, written)
+    batch = replay.sample(spec, rows, jnp.int32(written), jnp.arange(capacity, dtype=jnp.uint32), GAMMA)
+    for i in range(capacity):
+        summed, total = 0, 0.0
+        for transition in stored[len(stored) - 1 - i :][:3]:  # up to the newest one
+            total += GAMMA**summed * transition[2]
+            summed += 1
+            if transition[5]:
+                break
+        assert_allclose(batch.reward[i], total, rtol=1e-5, atol=1e-6)
+        assert_allclose(batch.discount[i], GAMMA**summed, rtol=1e-6)
+        assert_array_equal(batch.observation[i], stored[-1 - i][0])
+        assert_array_equal(batch.next_observation[i], transition[4])
+        assert batch.terminated[i] == transition[3]
+        assert batch.action[i] == stored[-1 - i][1]

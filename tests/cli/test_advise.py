@@ -1,0 +1,184 @@
+"""`uavmec advise` and the policy that ships with the package, as a user meets them."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from numpy.testing import assert_array_equal
+
+import uavmec_jax as um
+from tests.scenarios.test_scenario_files import EXAMPLES
+from uavmec_jax.cli import main
+from uavmec_jax.env.rollout import play_on
+from uavmec_jax.scenarios.policies import load_policy
+
+HARBOUR = EXAMPLES / "harbour.toml"
+
+
+def advise(*arguments):
+    return CliRunner().invoke(main, ["advise", *map(str, arguments)], catch_exceptions=False)
+
+
+@pytest.fixture(scope="module")
+def generalist():
+    return load_policy("generalist")
+
+
+@pytest.fixture(scope="module")
+def told():
+    done = advise(HARBOUR, "--samples", 32, "--json")
+    assert done.exit_code == 0, done.output
+    return json.loads(done.stdout)
+
+
+def test_json_says_what_was_asked(told):
+    names = um.load_inventory(HARBOUR).names
+    assert told["next"]["name"] in names
+    assert told["ranking"][0]["name"] == told["next"]["name"]
+    assert sorted(one["name"] for one in told["ranking"]) == sorted(names)
+    assert set(told["first_failure"]) == set(names)
+    assert abs(sum(told["first_failure"].values()) + told["no_device_fails"] - 1) < 1e-3
+    low, high = told["lifetime"]["interval"]
+    assert low <= told["lifetime"]["mean"] <= high
+    assert told["lifetime"]["futures"] == 32
+    assert told["what_if"][0]["gain"] >= told["what_if"][-1]["gain"]
+    assert told["warnings"] == []
+
+
+@pytest.mark.slow
+def test_one_visit_after_the_other(tmp_path, told):
+    """The state that it prints can be given back; the next one is advised on likewise."""
+    inventory = um.load_inventory(HARBOUR)
+    state = um.initial_state(inventory.params, inventory.layout)
+    volumes = jnp.full(6, 3e6)
+    after, outcome = um.transition(inventory.params, inventory.layout, state, told["next"]["device"] - 1, volumes)
+    assert int(outcome.cause) == um.Cause.NONE
+    from uavmec_jax.scenarios.state_files import state_data
+
+    (tmp_path / "now.json").write_text(json.dumps(state_data(after, inventory)))
+    done = advise(HARBOUR, "--state", tmp_path / "now.json", "--samples", 32, "--json", "--no-what-if")
+    again = json.loads(done.stdout)
+    assert again["state"]["slot"] == 1
+    assert again["what_if"] == []
+    assert again["lifetime"]["interval"][0] > 1
+
+
+@pytest.mark.slow
+def test_tables(generalist):
+    done = advise(HARBOUR, "--samples", 16)
+    assert done.exit_code == 0
+    for words in ("Visit next", "First to fail", "What a repair or a removal would bring now", "Next: #"):
+        assert words in done.stdout
+
+
+@pytest.mark.slow
+def test_a_layout_unlike_the_training_is_warned_of_and_advised_on(tmp_path):
+    text = HARBOUR.read_text().replace("capacity_j = 7", "capacity_j = 97", 1)
+    (tmp_path / "big.toml").write_text(text)
+    done = advise(tmp_path / "big.toml", "--samples", 8, "--no-what-if", "--json")
+    assert done.exit_code == 0
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("uavmec: warning: ")
+    assert "battery capacities in J" in line
+    assert "it was trained on 25,000 to 160,000" in line
+    assert len(json.loads(done.stdout)["warnings"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--samples", 1), "--samples is 1; give 2 to 100000 futures"),
+        (("--policy", "generalst"), "did you mean 'generalist'?"),
+        (("--price", 3), "--price is given, but nobody knows the traffic"),
+        (("--powered", 3), "leave out --powered"),
+        (("--state", "nowhere.json"), "nowhere.json"),
+    ],
+)
+def test_mistakes_are_one_line(arguments, words):
+    done = advise(HARBOUR, *arguments)
+    assert done.exit_code == 2
+    assert words in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.slow
+def test_traffic_has_a_price():
+    done = advise("--place", "albany", "--price", 10, "--samples", 8, "--no-what-if", "--json")
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["next"]["name"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [2, 12, 30])
+def test_the_shipped_policy_is_a_policy_like_any_other(generalist, n):
+    params = um.Params(n_devices=n)
+    layout = um.sample_layout(jax.random.key(n), params, n // 2, n // 2)
+    state = um.initial_state(params, layout)
+    alone = generalist(params, layout, state)
+    assert alone.shape == ()
+    assert 0 <= int(alone) < n
+    assert int(jax.jit(generalist)(params, layout, state)) == int(alone)
+    states = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), state)
+    assert_array_equal(generalist(params, layout, states), [alone, alone])
+    assert generalist.appraise(params, layout, states).shape == (2,)
+
+
+@pytest.mark.slow
+def test_it_decides_from_raw_observations(generalist):
+    params, layout = um.Params(), um.sample_layout(jax.random.key(1), um.Params(), 8, 8)
+    state = um.initial_state(params, layout)
+    seen = um.observe_devices(params, layout, state)
+    row = np.concatenate([seen.features, np.ones((12, 1), np.float32)], axis=1).reshape(-1)
+    assert generalist.act(row) == int(generalist(params, layout, state))
+    with pytest.raises(um.PolicyError, match="it should be"):
+        generalist.act(row[:-1])
+
+
+@pytest.mark.slow
+def test_it_is_far_above_oldest_first(generalist):
+    """Eight towns of the middle of the grid: 15 % is two thirds of what `results/generalist` has there."""
+    params = um.Params()
+
+    @jax.jit
+    def lives(key):
+        layout = um.sample_layout(key, params, 8, 8)
+        keys = jax.random.split(key, 4)
+        return [um.rollouts(one, params, layout, keys).length for one in (generalist, um.HEURISTICS["oldest-first"])]
+
+    own, oldest = jax.vmap(lives)(jax.random.split(jax.random.key(7), 24))
+    assert own.mean() > 1.12 * oldest.mean()
+
+
+@pytest.mark.slow
+def test_a_first_failure_is_foretold(generalist):
+    """The forecast of one town holds on other futures of it."""
+    params, layout = um.Params(), um.sample_layout(jax.random.key(11), um.Params(), 4, 8)
+    advice = um.advise(generalist, params, layout, samples=64)
+    state, keys = um.initial_state(params, layout), jax.random.split(jax.random.key(5), 64)
+    played = jax.jit(jax.vmap(lambda key: play_on(generalist, params, layout, state, key)))(keys)
+    share = np.asarray(played.first_failure).mean(axis=0)
+    assert np.abs(share - advice.first_failure).max() < 0.45
+    assert abs(np.asarray(played.length).mean() - advice.lifetimes.mean()) < 1.5
+
+
+def test_an_altered_file_is_refused(tmp_path, generalist):
+    from uavmec_jax.scenarios.policies import _SHIPPED
+
+    content = bytearray((_SHIPPED / "generalist.npz").read_bytes())
+    content[len(content) // 2] ^= 4
+    (tmp_path / "mine.npz").write_bytes(content)
+    with pytest.raises(um.PolicyError, match=r"mine\.npz"):
+        load_policy(tmp_path / "mine.npz")
+
+
+def test_a_file_with_other_features_is_refused(tmp_path, monkeypatch, generalist):
+    from uavmec_jax.scenarios import policy_files as collection
+
+    generalist.save(tmp_path / "mine.npz")
+    assert int(load_policy(tmp_path / "mine.npz").collection.n_devices) == 16
+    monkeypatch.setattr(collection, "FEATURES", collection.FEATURES[:-1])
+    with pytest.raises(um.PolicyError, match="see other features of a device than those of this version"):
+        load_policy(tmp_path / "mine.npz")

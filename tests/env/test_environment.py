@@ -1,0 +1,227 @@
+"""The environment: signatures, auto-reset, observation, known lifetimes, invariants."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from uavmec_jax.env.dynamics import Cause, initial_state, transition
+from uavmec_jax.env.environment import UavMecEnv
+from uavmec_jax.env.layout import sample_layout
+from uavmec_jax.env.observation import observe
+from uavmec_jax.env.params import Params
+from uavmec_jax.env.rollout import rollout, rollouts
+from uavmec_jax.env.scenario import make_scenario
+from uavmec_jax.planning.heuristics import HEURISTICS, oldest_first
+from uavmec_jax.planning.observation import FEATURES, observe_devices
+
+ENV = UavMecEnv()
+PARAMS = Params()
+
+
+def layout_of(seed, powered=8, connected=8, params=PARAMS):
+    return sample_layout(jax.random.key(seed), params, powered, connected)
+
+
+def test_first_observation_is_ones_then_zeros():
+    observation, state = ENV.reset(jax.random.key(0))
+    assert_array_equal(observation, [1.0] * 12 + [0.0] * 12)
+    assert observation.dtype == jnp.float32
+    assert state.slot == 0
+    assert ENV.num_actions(ENV.default_params) == 12
+    assert ENV.observation_shape(ENV.default_params) == (24,)
+
+
+def test_step_resets_by_itself_and_keeps_the_true_last_observation():
+    scenario = make_scenario(layout_of(0, 12, 0))
+    observation, state = ENV.reset(jax.random.key(0), scenario)
+    for slot in range(11):
+        previous = state
+        observation, state, _, terminated, truncated, info = ENV.step(jax.random.key(slot), state, 0, scenario)
+        assert info["length"] == slot + 1
+        assert bool(terminated) == (slot == 10)
+        assert not truncated
+        assert previous.slot == slot
+    assert info["cause"] == Cause.DATA_AGE
+    assert info["final_observation"][12:].max() == 11
+    assert_array_equal(observation, [1.0] * 12 + [0.0] * 12)
+    assert state.slot == 0
+
+
+def test_time_limit_truncates():
+    scenario = make_scenario(layout_of(0, 12, 12), Params(max_slots=3))
+    _, state = ENV.reset(jax.random.key(0), scenario)
+    flags = []
+    for slot in range(3):
+        _, state, _, terminated, truncated, _ = ENV.step(jax.random.key(slot), state, 0, scenario)
+        flags.append((bool(terminated), bool(truncated)))
+    assert flags == [(False, False), (False, False), (False, True)]
+    assert state.slot == 0
+
+
+def test_everything_powered_and_connected_lives_33_slots():
+    # 1,600 kJ / (80 W x 600 s) = 33.3 slots, if at least one device computes for the full 600 s.
+    keys = jax.random.split(jax.random.key(0), 20)
+    episodes = jax.vmap(lambda key: rollout(HEURISTICS["stay-put"], PARAMS, sample_layout(key, PARAMS, 12, 12), key))(
+        keys
+    )
+    assert_array_equal(episodes.length, 33)
+    assert_array_equal(episodes.cause, Cause.UAV)
+    assert not episodes.failed.any()
+
+
+@pytest.mark.slow
+def test_nothing_powered_or_connected_lives_11_slots_without_shared_hover_points():
+    params = Params(uav_signal_range_m=11.0)  # altitude 10 m: nobody within 4.6 m on the ground
+    keys = jax.random.split(jax.random.key(0), 20)
+    for policy in HEURISTICS.values():
+        episodes = jax.vmap(lambda key, p=policy: rollout(p, params, sample_layout(key, params, 0, 0), key))(keys)
+        assert_array_equal(episodes.length, 11)
+
+
+def test_rollout_gives_two_policies_the_same_volumes():
+    seen = {}
+
+    def spying(name, action):
+        def policy(params, layout, state, key=None):
+            jax.debug.callback(
+                lambda battery, slot: seen.setdefault((name, int(slot)), np.asarray(battery)), state.battery, state.slot
+            )
+            return jnp.int32(action)
+
+        return policy
+
+    layout = layout_of(2, 0, 12)
+    for name in ("a", "b"):
+        rollout(spying(name, 3), PARAMS, layout, jax.random.key(7))
+    jax.effects_barrier()
+    slots = {slot for _, slot in seen}
+    assert len(slots) > 5
+    for slot in slots:
+        assert_array_equal(seen["a", slot], seen["b", slot])
+
+
+def test_rollouts_differ_by_draw_and_repeat_by_key():
+    keys = jax.random.split(jax.random.key(0), 16)
+    first = rollouts(oldest_first, PARAMS, layout_of(5, 4, 4), keys)
+    again = rollouts(oldest_first, PARAMS, layout_of(5, 4, 4), keys)
+    jax.tree.map(assert_array_equal, first, again)
+    alone = rollout(oldest_first, PARAMS, layout_of(5, 4, 4), keys[3])
+    assert alone.length == first.length[3]
+    durations = [
+        transition(PARAMS, layout_of(5, 4, 4), initial_state(PARAMS, layout_of(5, 4, 4)), jnp.int32(0), volumes)[
+            1
+        ].duration
+        for volumes in jax.random.uniform(keys[0], (2, 12), minval=2e5, maxval=4e5)
+    ]
+    assert durations[0] != durations[1]
+
+
+@pytest.mark.slow
+@pytest.mark.bits
+def test_jit_and_vmap_change_nothing():
+    layouts = jax.vmap(lambda key: sample_layout(key, PARAMS, 6, 6))(jax.random.split(jax.random.key(0), 5))
+    volumes = jax.random.uniform(jax.random.key(1), (5, 12), minval=2e6, maxval=4e6)
+    states = jax.vmap(lambda layout: initial_state(PARAMS, layout))(layouts)
+    actions = jnp.arange(5, dtype=jnp.int32)
+    step = lambda *args: transition(PARAMS, *args)  # noqa: E731
+    batched = jax.vmap(step)(layouts, states, actions, volumes)
+    jitted = jax.jit(jax.vmap(step))(layouts, states, actions, volumes)
+    for i in range(5):
+        alone = step(*(jax.tree.map(lambda leaf, i=i: leaf[i], (layouts, states, actions, volumes))))
+        for many in (batched, jitted):
+            jax.tree.map(lambda a, b, i=i: assert_allclose(a, b[i], rtol=2e-6), alone, many)
+
+
+states = st.fixed_dictionaries(
+    {
+        "seed": st.integers(0, 10_000),
+        "n": st.sampled_from([2, 5, 12, 64]),
+        "slots": st.integers(1, 8),
+        "power": st.floats(0, 1),
+        "comms": st.floats(0, 1),
+    }
+)
+
+
+@pytest.mark.slow
+@settings(max_examples=25, deadline=None)
+@given(states)
+def test_invariants_of_random_play(case):
+    n = case["n"]
+    params = Params(n_devices=n)
+    key = jax.random.key(case["seed"])
+    layout = sample_layout(key, params, int(case["power"] * n), int(case["comms"] * n))
+    state = initial_state(params, layout)
+    for slot in range(case["slots"]):
+        k_action, k_volumes = jax.random.split(jax.random.fold_in(key, slot))
+        action = jax.random.randint(k_action, (), 0, n)
+        volumes = jax.random.uniform(k_volumes, (n,), minval=2e6, maxval=4e6)
+        before = state
+        state, outcome = transition(params, layout, before, action, volumes)
+        assert (state.battery <= before.battery).all()
+        assert state.uav_energy <= before.uav_energy
+        assert (state.age >= 0).all()
+        assert (state.age <= 11).all()
+        assert_array_equal(state.battery[layout.has_power], layout.capacity[layout.has_power])
+        assert_array_equal(state.age[layout.has_comms], 0)
+        assert_array_equal(state.age[outcome.served], 0)
+        observation = observe(layout, state)
+        assert (observation[:n] >= 0).all()
+        assert (observation[:n] <= 1).all()
+        if outcome.cause in (Cause.BATTERY, Cause.DATA_AGE):
+            assert outcome.failed.any()
+            assert_allclose(outcome.first_failure.sum(), 1.0, rtol=1e-6)
+        else:
+            assert not outcome.failed.any()
+        if outcome.cause != Cause.NONE:
+            break
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10_000), st.integers(0, 11))
+def test_renumbering_the_devices_renumbers_the_outcome(seed, action):
+    key = jax.random.key(seed)
+    layout = sample_layout(key, PARAMS, 6, 6)
+    volumes = jax.random.uniform(key, (12,), minval=2e6, maxval=4e6)
+    order = jax.random.permutation(key, 12)
+    renumbered = jax.tree.map(lambda leaf: leaf[order], layout)
+    new_action = jnp.argmax(order == action).astype(jnp.int32)
+    state, outcome = transition(PARAMS, layout, initial_state(PARAMS, layout), jnp.int32(action), volumes)
+    other, other_outcome = transition(PARAMS, renumbered, initial_state(PARAMS, renumbered), new_action, volumes[order])
+    assert_allclose(other.battery, state.battery[order], rtol=1e-6)
+    assert_array_equal(other.age, state.age[order])
+    assert_array_equal(other_outcome.served, outcome.served[order])
+    assert_allclose(other_outcome.duration, outcome.duration, rtol=1e-6)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_seeds_differ_and_repeat(seed):
+    same = layout_of(seed), layout_of(seed)
+    jax.tree.map(assert_array_equal, *same)
+    assert (layout_of(seed).position != layout_of(seed + 1).position).any()
+
+
+@pytest.mark.slow
+def test_another_way_to_see():
+    """The environment with the full observation plays the same slots, and tells the true last observation likewise."""
+    scenario = make_scenario()
+    plain, full = UavMecEnv(), UavMecEnv(see=observe_devices)
+    assert full.observation_shape(scenario).features == (12, len(FEATURES))
+    seen, state = full.reset(jax.random.key(0), scenario)
+    _, same = plain.reset(jax.random.key(0), scenario)
+    for number in range(12):  # visiting one device over and over: the data of the others expire
+        key = jax.random.key(number)
+        seen, state, reward, ended, _, info = full.step(key, state, 3, scenario)
+        _, same, other_reward, other_end, _, _ = plain.step(key, same, 3, scenario)
+        assert (float(reward), bool(ended)) == (float(other_reward), bool(other_end))
+        if ended:
+            break
+    assert bool(ended)
+    age = [feature.name for feature in FEATURES].index("age")
+    assert float(jnp.max(info["final_observation"].features[:, age])) == 1.0
+    assert float(jnp.max(seen.features[:, age])) == 0.0
+    assert_array_equal(state.age, same.age)

@@ -1,0 +1,137 @@
+"""The environment as other libraries see it."""
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from numpy.testing import assert_allclose, assert_array_equal
+
+import uavmec_jax as um
+from uavmec_jax.env.observation import observe
+from uavmec_jax.env.scenario import draw_volumes, make_scenario
+from uavmec_jax.interop import ENV_ID
+from uavmec_jax.interop.five_values import FiveValueEnv
+from uavmec_jax.interop.gymnasium_env import UavMecGymEnv
+from uavmec_jax.interop.vector_env import UavMecVectorEnv
+
+
+@pytest.fixture(scope="module")
+def env():
+    made = gymnasium.make(ENV_ID, render_mode="rgb_array")
+    yield made
+    made.close()
+
+
+def test_gymnasium_checks_it(env):
+    check_env(env.unwrapped)
+
+
+def test_an_episode_is_the_transition_of_the_model(env):
+    scenario = env.unwrapped.scenario
+    observation, info = env.reset(seed=3)
+    assert_allclose(observation, np.repeat([1.0, 0.0], 12), atol=1e-6)
+    assert info == {}
+    generator = np.random.default_rng(3)  # as Gymnasium seeds it
+    state, step = um.initial_state(scenario.params, scenario.layout), jax.jit(um.transition)
+    for slot in range(40):
+        volumes = draw_volumes(scenario.params, jnp.asarray(generator.random(12, dtype=np.float32)))
+        action = (5 * slot) % 12
+        state, outcome = step(scenario.params, scenario.layout, state, action, volumes)
+        observation, reward, terminated, truncated, info = env.step(action)
+        assert_allclose(observation, observe(scenario.layout, state), rtol=1e-6)
+        assert np.isfinite(reward)
+        assert not truncated
+        assert terminated == (outcome.cause != um.Cause.NONE)
+        assert info["cause"] == um.Cause(int(outcome.cause)).name.lower()
+        assert_array_equal(info["failed"], outcome.failed)
+        assert_array_equal(info["served"], outcome.served)
+        assert (info["length"], info["duration"]) == (state.slot, pytest.approx(float(outcome.duration)))
+        if terminated:
+            break
+    assert terminated
+    assert info["failed"].any()
+    assert_allclose(info["first_failure"].sum(), 1.0, rtol=1e-6)
+
+
+def test_the_time_limit_truncates():
+    short = UavMecGymEnv(make_scenario(params=um.Params(max_slots=2)))
+    short.reset(seed=0)
+    assert [short.step(0)[2:4] for _ in range(2)] == [(False, False), (False, True)]
+
+
+def test_render_draws_the_map(env):
+    env.reset(seed=0)
+    first = env.render()
+    env.step(4)
+    second = env.render()
+    assert first.shape == second.shape == (480, 640, 3)
+    assert first.dtype == np.uint8
+    assert (first != second).any()
+    assert UavMecGymEnv().render() is None
+    with pytest.raises(ValueError, match="render_mode is 'human'; it should be None or 'rgb_array'"):
+        UavMecGymEnv(render_mode="human")
+
+
+def test_vector_environment_is_many_single_ones():
+    envs = gymnasium.make_vec(ENV_ID, num_envs=4)
+    first, _ = envs.reset(seed=1)
+    assert first.shape == (4, 24)
+    assert envs.action_space.shape == (4,)
+    again = UavMecVectorEnv(4)
+    again.reset(seed=1)
+    ended_before = np.zeros(4, bool)
+    for slot in range(25):
+        actions = np.array([slot, 2 * slot, 0, 7 * slot]) % 12
+        observation, reward, terminated, truncated, info = envs.step(actions)
+        same = again.step(actions)
+        assert_array_equal(observation, same[0])
+        assert_array_equal(reward, same[1])
+        assert observation.dtype == np.float32
+        assert terminated.dtype == truncated.dtype == bool
+        ended = terminated | truncated
+        assert_array_equal(info["cause"] != "none", ended)
+        if ended.any():
+            assert_array_equal(info["_final_obs"], ended)
+            assert_allclose(observation[ended], first[ended], atol=1e-6)  # restarted in the same step
+            for place in np.flatnonzero(ended):
+                assert (info["final_obs"][place] != observation[place]).any()
+                assert info["final_info"]["failed"][place].any() or info["cause"][place] == "uav"
+        ended_before |= ended
+    assert ended_before.all()
+
+
+def test_vector_environment_takes_one_scenario_or_as_many_as_there_are():
+    scenario = make_scenario()
+    assert UavMecVectorEnv(3, scenario).reset(seed=0)[0].shape == (3, 24)
+    many = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), scenario)
+    with pytest.raises(ValueError, match="scenario holds 2 layouts; it should hold 3"):
+        UavMecVectorEnv(3, many)
+
+
+def test_seeds_make_the_volumes():
+    envs = UavMecVectorEnv(2, make_scenario())
+
+    def ages_and_batteries(seed):
+        envs.reset(seed=seed)
+        return np.stack([envs.step(np.array([3, 3]))[0] for _ in range(3)])
+
+    assert_array_equal(ages_and_batteries(0), ages_and_batteries(0))
+    assert (ages_and_batteries(0) != ages_and_batteries(1)).any()
+    batteries = ages_and_batteries(0)[:, :, :12]
+    assert (batteries[:, 0] != batteries[:, 1]).any()  # the same layout, other volumes
+
+
+def test_five_values():
+    env, params = FiveValueEnv(), FiveValueEnv().default_params
+    observation, state = env.reset(jax.random.key(0), params)
+    assert observation.shape == (24,)
+    step = jax.jit(env.step)
+    for _ in range(40):
+        observation, state, _, done, info = step(jax.random.key(1), state, 0, params)
+        if done:
+            break
+    assert done
+    assert info["discount"] == 0.0
+    assert state.slot == 0

@@ -1,0 +1,78 @@
+"""Small studies, and runs of them in processes of their own."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+FINAL = ("agents.csv", "curves.npz", "evaluation.npz", "weights.npz", "study.toml")
+"""Files whose bits do not hang on when and how often a run was stopped."""
+
+TINY = """
+name = "tiny"
+algorithm = "a2c"
+reward = "U"
+steps = 4000
+[axes]
+powered = [12, 4]
+connected = [8]
+seeds = 2
+[evaluation]
+draws = 3
+validate_every = 500
+validation_draws = 2
+planners = []
+baselines = ["oldest-first"]
+"""
+
+
+class Enough(KeyboardInterrupt):
+    """Somebody presses Ctrl-C."""
+
+
+def stop_after(chunks):
+    """Told of progress, interrupts after so many chunks."""
+    told = []
+
+    def on_progress(news):
+        told.append(news)
+        if len(told) == chunks:
+            raise Enough
+
+    return on_progress
+
+
+def command(*arguments) -> list[str]:
+    return [sys.executable, "-m", "uavmec_jax", *map(str, arguments)]
+
+
+def uavmec(*arguments, cwd, check=True, **options) -> subprocess.CompletedProcess:
+    done = subprocess.run(
+        command(*arguments), cwd=cwd, capture_output=True, text=True, timeout=300, env=environment(), **options
+    )
+    assert not check or done.returncode == 0, done.stderr + done.stdout
+    return done
+
+
+def start(*arguments, cwd) -> subprocess.Popen:
+    return subprocess.Popen(
+        command(*arguments), cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment()
+    )
+
+
+def environment() -> dict[str, str]:
+    root = str(Path(__file__).parents[2])
+    return os.environ | {"PYTHONPATH": root, "COLUMNS": "200"}
+
+
+def bits(directory: Path) -> dict[str, bytes]:
+    """The final files of a run."""
+    return {name: (directory / name).read_bytes() for name in FINAL}
+
+
+def events(directory: Path, kind: str) -> list[dict]:
+    """What the workers of a run have logged of one kind."""
+    import json
+
+    lines = [line for file in sorted((directory / "log").glob("*.jsonl")) for line in file.read_text().splitlines()]
+    return [event for event in map(json.loads, lines) if event["event"] == kind]

@@ -1,0 +1,275 @@
+"""The folder of a run: resumed, damaged, altered, shared."""
+
+import json
+import re
+import shutil
+
+import jax
+import numpy as np
+import pytest
+
+import uavmec_jax as um
+from tests.runs.processes import FINAL, TINY, Enough, bits, events, stop_after
+from uavmec_jax.errors import StudyError
+from uavmec_jax.runs import folder as folders
+from uavmec_jax.runs import run as running
+from uavmec_jax.runs.folder import Durability, RunFolder
+from uavmec_jax.runs.results_folder import load_results
+from uavmec_jax.runs.run import resume_run, run_study
+from uavmec_jax.runs.shared_run import prepare_run, work_on
+from uavmec_jax.runs.status import run_status
+from uavmec_jax.studies.study import parse_study
+
+pytestmark = pytest.mark.slow
+
+STUDY = parse_study(TINY, "tiny")
+OFTEN = Durability(snapshot_every_s=0.0)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    directory = tmp_path_factory.mktemp("whole") / "run"
+    run_study(STUDY, directory, shard_size=2, command="x")
+    return directory
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory):
+    """The first shard is finished, the second one has two snapshots."""
+    directory = tmp_path_factory.mktemp("stopped") / "run"
+    results = run_study(STUDY, directory, shard_size=2, command="x", durability=OFTEN, on_progress=stop_after(50))
+    assert results.run["stopped_by"] == 2
+    assert len(results.agents) == 2
+    running.resume_run(directory, on_progress=stop_after(6))
+    return directory
+
+
+def copied(directory, tmp_path):
+    return shutil.copytree(directory, tmp_path / "copy")
+
+
+def flip(path, where=0.5):
+    data = bytearray(path.read_bytes())
+    data[int(len(data) * where)] ^= 1
+    path.write_bytes(bytes(data))
+
+
+def snapshots(directory):
+    return sorted((directory / "shards" / "00001").glob("snapshot-*.npz"))
+
+
+def test_stopped_anywhere_it_ends_with_the_same_bits(whole, stopped, tmp_path):
+    directory = copied(stopped, tmp_path)
+    assert len(snapshots(directory)) == 2
+    results = resume_run(directory)
+    assert results.run["complete"]
+    assert bits(directory) == bits(whole)
+    assert not (directory / "shards").exists()
+    assert resume_run(directory).run["complete"]  # nothing is left to do
+
+
+def test_what_is_finished_can_be_shown_before_the_rest(whole, stopped):
+    results = load_results(stopped)
+    assert (len(results.agents), results.run["complete"]) == (2, False)
+    assert results.agents.equals(load_results_exact(whole).agents[:2])
+
+
+def load_results_exact(directory):
+    """The agents as the shards have them, before they are rounded in the table."""
+    return run_study(STUDY, shard_size=2)
+
+
+@pytest.mark.parametrize("damage", [flip, lambda path: path.write_bytes(path.read_bytes()[:-900])], ids=["bit", "end"])
+def test_a_damaged_snapshot_is_named_and_the_one_before_is_used(whole, stopped, tmp_path, damage):
+    directory = copied(stopped, tmp_path)
+    older, newest = snapshots(directory)
+    damage(newest)
+    resume_run(directory)
+    (told,) = events(directory, "damaged")
+    assert told["file"] == newest.name
+    assert events(directory, "restored")[-1]["file"] == older.name
+    assert bits(directory) == bits(whole)
+
+
+def test_without_a_sound_snapshot_the_shard_starts_again(whole, stopped, tmp_path):
+    directory = copied(stopped, tmp_path)
+    before = len(events(directory, "restored"))
+    for path in snapshots(directory):
+        flip(path)
+    resume_run(directory)
+    assert len(events(directory, "damaged")) == 2
+    assert len(events(directory, "restored")) == before
+    assert bits(directory) == bits(whole)
+
+
+def test_a_snapshot_of_another_shard_or_run_is_not_used(whole, stopped, tmp_path):
+    directory = copied(stopped, tmp_path)
+    other = tmp_path / "other"
+    run_study(STUDY, other, command="y", shard_size=2, durability=OFTEN, on_progress=stop_after(4))
+    (foreign, *_) = sorted((other / "shards" / "00000").glob("snapshot-*.npz"))
+    shutil.copy(foreign, snapshots(directory)[-1])
+    resume_run(directory)
+    assert "is of another run" in events(directory, "damaged")[0]["error"]
+    assert bits(directory) == bits(whole)
+
+
+@pytest.mark.parametrize("damage", [flip, lambda path: path.write_bytes(path.read_bytes()[:100])], ids=["bit", "end"])
+def test_a_damaged_result_is_named_and_made_again(whole, stopped, tmp_path, damage):
+    directory = copied(stopped, tmp_path)
+    damage(directory / "shards" / "00000" / "result.npz")
+    with pytest.raises(StudyError, match=r"00000/result.npz: (cannot be read|was altered|is not a finished)"):
+        load_results(directory)
+    resume_run(directory)
+    assert [(told["shard"], told["file"]) for told in events(directory, "damaged")] == [(0, "result.npz")]
+    assert bits(directory) == bits(whole)
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("plan.json", r"plan\.json: (cannot be read|was altered)"),
+        ("study.toml", r"study\.toml: was altered or damaged"),
+    ],
+)
+def test_a_damaged_plan_is_refused(stopped, tmp_path, name, line):
+    directory = copied(stopped, tmp_path)
+    path = directory / name
+    path.write_bytes(path.read_bytes().replace(b"4000" if name == "study.toml" else b'"agents": 4', b"4001", 1))
+    for use in (resume_run, run_status, work_on):
+        with pytest.raises(StudyError, match=line):
+            use(directory)
+
+
+def test_damaged_logs_and_leases_do_no_harm(whole, stopped, tmp_path):
+    directory = copied(stopped, tmp_path)
+    for path in [*(directory / "log").iterdir(), *(directory / "shards").rglob("lease-*.json")]:
+        path.write_bytes(path.read_bytes()[:20])
+    path = directory / "plan.json"
+    facts = json.loads(path.read_text())
+    facts["durability"]["lease_s"] = 0.5
+    facts["sha256"] = folders._digest(facts)
+    path.write_text(json.dumps(facts))
+    for snapshot in snapshots(directory):
+        snapshot.unlink()  # they are of the plan as it was
+    resume_run(directory)
+    assert bits(directory) == bits(whole)
+
+
+@pytest.mark.parametrize("name", ["agents.csv", "evaluation.npz", "curves.npz", "run.json"])
+def test_a_flipped_bit_in_the_results_is_found(whole, tmp_path, name):
+    directory = copied(whole, tmp_path)
+    flip(directory / name, 0.4)
+    if name == "run.json":
+        (directory / name).write_text((directory / name).read_text(errors="replace").replace('"complete"', '"comp', 1))
+    with pytest.raises(StudyError, match=r"cannot be read"):
+        load_results(directory)
+
+
+def test_a_newer_schema_is_refused(stopped, tmp_path):
+    directory = copied(stopped, tmp_path)
+    path = directory / "plan.json"
+    path.write_text(path.read_text().replace('"schema": 1', '"schema": 7', 1))
+    with pytest.raises(StudyError, match=r"plan.json: schema is 7; this version reads 1"):
+        resume_run(directory)
+
+
+def test_other_code_is_refused_unless_it_is_wanted(whole, stopped, tmp_path, monkeypatch):
+    directory = copied(stopped, tmp_path)
+    monkeypatch.setattr(folders.host, "code_digest", lambda: "0123456789abcdef")
+    with pytest.raises(StudyError, match=r"was planned by other code \(uavmec_jax's code \w+ -> 0123456789ab\)"):
+        resume_run(directory)
+    results = resume_run(directory, other_code=True)
+    assert results.run["other_code"]
+    assert bits(directory) == bits(whole)
+
+
+def test_a_second_process_is_refused_and_told_who_is_there(tmp_path):
+    said = []
+
+    def second(_):
+        for attempt in (lambda: resume_run(tmp_path / "run"), lambda: run_study(STUDY, tmp_path / "run")):
+            with pytest.raises(StudyError) as refused:
+                attempt()
+            said.append(str(refused.value))
+        raise Enough
+
+    run_study(STUDY, tmp_path / "run", on_progress=second)
+    assert len(said) == 2
+    for line in said:
+        assert re.search(r"run: process \d+ on \S+ is at work in it; to help it, start `uavmec worker .*run`", line)
+
+
+def test_workers_share_a_run_and_the_last_one_puts_it_together(whole, tmp_path):
+    prepare_run(STUDY, tmp_path / "run", command="x", shard_size=2)
+    assert run_status(tmp_path / "run").shards["waiting"] == 2
+    assert work_on(tmp_path / "run")
+    assert bits(tmp_path / "run") == bits(whole)
+    assert run_status(tmp_path / "run").complete
+    assert work_on(tmp_path / "run")  # one that comes late finds nothing to do
+
+
+def test_a_shard_that_fails_does_not_stop_the_others(whole, tmp_path, monkeypatch):
+    start = running.Bench.start
+
+    def broken(self, shard):
+        if shard.number == 0:
+            raise ZeroDivisionError("by zero")
+        return start(self, shard)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(running.Bench, "start", broken)
+        with pytest.raises(StudyError, match=r"1 of 2 shards failed, shard 0 with ZeroDivisionError: by zero .*resume"):
+            run_study(STUDY, tmp_path / "run", command="x", shard_size=2)
+    status = run_status(tmp_path / "run")
+    assert (status.shards["failed"], status.shards["done"]) == (1, 1)
+    assert status.failures == {0: "ZeroDivisionError: by zero"}
+    resume_run(tmp_path / "run")
+    assert bits(tmp_path / "run") == bits(whole)
+
+
+def test_weights_snapshots_are_policies_and_the_shard_starts_again(whole, tmp_path):
+    light = Durability(snapshot="weights", snapshot_every_s=0.0, snapshot_share=1.0)
+    run_study(STUDY, tmp_path / "run", command="x", shard_size=2, durability=light, on_progress=stop_after(10))
+    older, newest = sorted((tmp_path / "run" / "shards" / "00000").glob("snapshot-*.npz"))
+    policy = um.load_policy(newest, seed=0, powered=12)
+    layout = um.sample_layout(jax.random.key(0), um.Params(), 12, 8)
+    assert 0 <= policy(um.Params(), layout, um.initial_state(um.Params(), layout)) < 12
+    assert older.stat().st_size < 300_000
+    resume_run(tmp_path / "run")
+    assert not events(tmp_path / "run", "restored")
+    assert bits(tmp_path / "run") == bits(whole)
+
+
+@pytest.mark.parametrize("name", ["a b", "täst-ünï-日本", "deep/er/../run", "link"])
+def test_any_path_will_do(whole, tmp_path, name):
+    (tmp_path / "deep" / "er").mkdir(parents=True)
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "elsewhere")
+    run_study(STUDY, tmp_path / name, command="x", shard_size=2, on_progress=stop_after(3))
+    resume_run(tmp_path / name)
+    assert bits(tmp_path / name) == bits(whole)
+
+
+def test_the_log_says_what_happened(stopped):
+    assert [told["shard"] for told in events(stopped, "claimed")] == [0, 1, 1]
+    assert [told["taken_over"] for told in events(stopped, "claimed")] == [False, False, True]
+    assert events(stopped, "chunk")[0].keys() == {
+        "event", "at", "shard", "steps", "episode_length", "steps_per_second"
+    }  # fmt: skip
+
+
+def test_results_as_tables(whole):
+    results = um.load_results(whole)
+    curves, episodes = results.curve_table(), results.episode_table()
+    assert curves.columns.tolist() == ["seed", "powered", "connected", "steps", "curve", "value"]
+    assert set(curves["curve"]) == {"episode_length", "validation"}
+    assert len(curves[curves["curve"] == "validation"]) == 4 * 8
+    best = episodes[(episodes["policy"] == "best") & ~episodes["fixed"]]
+    mean = best.groupby(["seed", "powered"], sort=False)["lifetime"].mean()
+    assert np.allclose(mean, results.agents["best_lifetime"], atol=1e-5)
+    assert jax.device_count() == 2
+
+
+def test_final_files_are_those_that_are_compared(whole):
+    assert {file.name for file in whole.iterdir()} == {*FINAL, "run.json", "plan.json", "log"}
+    assert RunFolder.open(whole).complete

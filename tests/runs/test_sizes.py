@@ -1,0 +1,58 @@
+"""Runs of many agents: planned and looked at quickly, or refused."""
+
+import pytest
+
+from tests.runs.processes import TINY
+from uavmec_jax.errors import StudyError
+from uavmec_jax.runs.checkpoints import interval_s
+from uavmec_jax.runs.run import run_study
+from uavmec_jax.runs.run_plan import plan_study
+from uavmec_jax.runs.shared_run import prepare_run
+from uavmec_jax.runs.simulate import simulate
+from uavmec_jax.runs.status import run_status
+from uavmec_jax.studies import study as studies
+from uavmec_jax.studies.study import load_study, parse_study
+
+
+def test_a_hundred_thousand_agents_are_planned_and_looked_at_without_making_one(tmp_path, monkeypatch):
+    def nobody(study):
+        raise AssertionError("the agents were enumerated")
+
+    monkeypatch.setattr(studies, "identities", nobody)
+    study = parse_study(TINY, "tiny", {"axes.seeds": 50_000})
+    prepare_run(study, tmp_path / "run")
+    status = run_status(tmp_path / "run")
+    assert status.agents == 100_000
+    assert status.shards["waiting"] > 1000
+    assert status.of_steps == 100_000 * 4000
+    assert [path.name for path in (tmp_path / "run" / "shards").iterdir()] == ["lease-0001.json"]
+
+
+def test_large_snapshots_come_less_often():
+    assert interval_s(60.0, 0.02, size=1e6) == 60.0
+    assert interval_s(60.0, 0.02, size=1e6, cost_s=3.0) == pytest.approx(150.0)
+    assert interval_s(0.0, 0.1, size=1.5e9) == pytest.approx(100.0)  # at 150 MB/s, before one was written
+
+
+def test_a_population_beyond_all_memory_is_refused_with_an_estimate(tmp_path):
+    study = parse_study(TINY, "tiny", {"axes.seeds": 500_000_000})
+    for use in (plan_study, lambda s: run_study(s, tmp_path / "run"), lambda s: prepare_run(s, tmp_path / "run")):
+        with pytest.raises(StudyError, match=r"1,000,000,000 agents need 93,132 GiB of memory, and as much disk"):
+            use(study)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_simulation_adds_up():
+    study = load_study("table5", {"axes.seeds": 8})  # 200 agents
+    plan = plan_study(study, shard_size=40)
+    groups = plan.blocks["dqn"].groups
+    one, two = (simulate(study, plan, speed=100_000, devices=n * groups) for n in (1, 2))
+    assert one.training_s == pytest.approx(200 * 1_000_000 / (100_000 * groups), rel=0.01)
+    assert two.training_s == pytest.approx(one.training_s * 3 / 5, rel=0.01)  # five shards, two at a time
+    assert (one.workers, two.workers) == (1, 2)
+    fast = simulate(study, plan, speed={"dqn": 200_000}, devices=groups)
+    assert fast.training_s == pytest.approx(one.training_s / 2)
+    assert fast.other_s == one.other_s
+    assert one.memory_bytes > plan.blocks["dqn"].bytes
+    assert "wall time" in str(one)
+    assert one.as_json()["wall_s"] == one.training_s + one.other_s

@@ -1,0 +1,35 @@
+"""Signals end a run between two chunks, or at once where it says so."""
+
+import os
+import signal
+
+import pytest
+
+from uavmec_jax.runs.signals import Stop, Stopped
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_is_noted_and_the_second_one_interrupts(number):
+    before = signal.getsignal(number)
+    with Stop() as stop:
+        stop.check()
+        os.kill(os.getpid(), number)
+        with pytest.raises(Stopped) as stopped:
+            stop.check()
+        assert stopped.value.signal == number
+        with pytest.raises(Stopped):
+            os.kill(os.getpid(), number)
+    assert signal.getsignal(number) == before
+
+
+def test_at_once_means_at_once():
+    def work(stop, before):
+        if before:
+            os.kill(os.getpid(), signal.SIGTERM)
+        with stop.at_once():
+            os.kill(os.getpid(), signal.SIGTERM)
+            raise AssertionError("too late")
+
+    for before in (False, True):
+        with Stop() as stop, pytest.raises(Stopped):
+            work(stop, before)

@@ -1,0 +1,207 @@
+"""Saved policies: what comes back acts as what was trained, and what was tampered with is refused in one line."""
+
+import itertools
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import traverse_util
+from numpy.testing import assert_allclose, assert_array_equal
+
+import uavmec_jax as um
+from tests.runs.test_run import TOML as TINY
+from uavmec_jax.agents import dqn, ppo
+from uavmec_jax.env.observation import observe
+from uavmec_jax.errors import PolicyError
+from uavmec_jax.planning.heuristics import HEURISTICS
+from uavmec_jax.runs.run import run_study
+from uavmec_jax.scenarios.policies import TrainedPolicy, load_policy
+from uavmec_jax.scenarios.policy_files import Collection, write_collection
+from uavmec_jax.scenarios.seeds import held_out_draws, town
+from uavmec_jax.studies.schema import DQNSettings, PPOSettings
+from uavmec_jax.studies.study import parse_study
+
+ONE = {"algorithm": "dqn", "powered": 12, "connected": 4, "seed": 1}
+
+
+def collection_of(name, network, settings, agents):
+    """A collection with random weights, best and last."""
+    make = jax.jit(jax.vmap(lambda key: network.init(key, jnp.zeros((1, 24)))))
+    kinds = {kind: make(jax.random.split(jax.random.key(i), len(agents))) for i, kind in enumerate(("best", "last"))}
+    weights = traverse_util.flatten_dict({name: kinds}, sep="/")
+    return Collection(
+        settings={name: settings.model_dump(mode="json")},
+        n_devices=12,
+        agents={name: agents},
+        weights={key: np.asarray(leaf) for key, leaf in weights.items()},
+    )
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """The folder of a run of eight DQN agents, as far as policies need it."""
+    directory = tmp_path_factory.mktemp("run")
+    places = itertools.product((0, 1), (12, 4), (12, 4))
+    agents = [dict(zip(("seed", "powered", "connected"), place, strict=True)) for place in places]
+    write_collection(
+        directory / "weights.npz",
+        collection_of("dqn", dqn.DQNSpec(hidden=(16,)).network, DQNSettings(hidden=(16,)), agents),
+    )
+    return directory
+
+
+@pytest.fixture(scope="module")
+def ppo_policy():
+    """A PPO policy on ages divided by ten."""
+    agents = [{"seed": seed, "powered": 8, "connected": 8} for seed in range(3)]
+    settings = PPOSettings(hidden=(16,), age_scale=0.1)
+    return TrainedPolicy.of(collection_of("ppo", ppo.PPOSpec(hidden=(16,)).network, settings, agents), "ppo", 2, "best")
+
+
+@pytest.mark.slow
+def test_an_agent_of_a_run_lives_as_long_as_the_table_says(tmp_path):
+    results = run_study(parse_study(TINY, "tiny"), tmp_path / "run")
+    policy = load_policy(tmp_path / "run", powered=4, connected=12, seed=1)
+    assert policy.trained_on == {"seed": 1, "powered": 4, "connected": 12}
+    layout = town(1, um.Params(), 4, 12)
+    played = jax.jit(lambda keys: um.rollouts(policy, um.Params(), layout, keys))(held_out_draws(1, 4, 12, 5))
+    row = results.agents.query("powered == 4 and connected == 12 and seed == 1")
+    assert_allclose(played.length.mean(), row["best_lifetime"].item(), rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["dqn", "ppo"])
+def test_batched_states_and_numpy_observations(run, ppo_policy, kind):
+    policy = ppo_policy if kind == "ppo" else load_policy(run, "last", powered=12, connected=4, seed=0)
+    layout = town(0, um.Params(), 12, 4)
+    state = um.initial_state(um.Params(), layout)
+    states = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (3, 2, *leaf.shape)), state)
+    states = states.replace(age=jax.random.randint(jax.random.key(0), (3, 2, 12), 0, 10))
+    actions = policy(um.Params(), layout, states)
+    assert actions.shape == (3, 2)
+    alone = jax.vmap(jax.vmap(lambda state: policy(um.Params(), layout, state)))(states)
+    assert_array_equal(actions, alone)
+    assert_array_equal(policy.act(np.asarray(observe(layout, states))), actions)
+    assert policy.act(np.asarray(observe(layout, state))).shape == ()
+
+
+def test_a_policy_of_its_own_file(ppo_policy, tmp_path):
+    ppo_policy.save(tmp_path / "mine.npz")
+    again = load_policy(tmp_path / "mine.npz")
+    assert isinstance(again, TrainedPolicy)
+    assert again.algorithm == "ppo"
+    assert again.trained_on == {"seed": 2, "powered": 8, "connected": 8}
+    observations = np.random.default_rng(0).random((50, 24), np.float32) * np.repeat([1, 11], 12)
+    assert_array_equal(again.act(observations), ppo_policy.act(observations))
+    assert len(set(again.act(observations).tolist())) > 1
+
+
+def test_policies_by_name():
+    assert load_policy("oldest-first") is HEURISTICS["oldest-first"]
+    assert callable(load_policy("rollout"))
+    with pytest.raises(PolicyError, match="did you mean 'oldest-first'"):
+        load_policy("oldest-frist")
+
+
+@pytest.mark.parametrize(
+    ("axes", "message"),
+    [
+        ({}, "8 agents have anything; say which: they differ in connected, powered, seed"),
+        ({"powered": 12, "seed": 1}, "2 agents have powered=12, seed=1; say which: they differ in connected"),
+        ({"powered": 8}, "none of the 8 agents has powered=8"),
+        ({"colour": 1}, "'colour' tells no agents apart; they have algorithm, connected, powered, seed"),
+    ],
+)
+def test_which_agent(run, axes, message):
+    with pytest.raises(PolicyError) as error:
+        load_policy(run, **axes)
+    assert str(error.value) == f"{run / 'weights.npz'}: {message}"
+
+
+def test_which_weights(run):
+    with pytest.raises(PolicyError, match="there are no 'worst' weights of 'dqn'; there are best and last of dqn"):
+        um.load_policy(run, "worst", **ONE)
+
+
+@pytest.mark.parametrize("shape", [(), (23,), (24, 3)])
+def test_observation_of_another_shape(run, shape):
+    policy = load_policy(run, **ONE)
+    with pytest.raises(PolicyError) as error:
+        policy.act(np.zeros(shape))
+    assert str(error.value) == f"the observation has the shape {shape}; it should be (24,) or (..., 24)"
+
+
+def test_observation_that_is_none_and_another_number_of_devices(run):
+    policy = load_policy(run, **ONE)
+    with pytest.raises(PolicyError, match="is not an array of numbers"):
+        policy.act(["a", "b"])
+    params = um.Params(n_devices=5)
+    layout = town(0, params, 2, 2)
+    with pytest.raises(PolicyError, match="was trained for 12 devices; the layout has 5"):
+        policy(params, layout, um.initial_state(params, layout))
+
+
+def rewritten(source, target, change):
+    """A copy of a policy file with its header or arrays changed, as someone with an editor would."""
+    with np.load(source) as arrays:
+        kept = {name: arrays[name] for name in arrays.files}
+    facts = json.loads(str(kept.pop("header")))
+    change(facts, kept)
+    np.savez_compressed(target, header=np.array(json.dumps(facts)), **kept)
+
+
+def flip_weight(facts, arrays):
+    arrays["dqn/best/params/TorchDense_0/kernel"][0, 0, 0] += 1
+
+
+def newer(facts, arrays):
+    facts["schema"] = 7
+
+
+def other_discount(facts, arrays):
+    facts["settings"]["dqn"]["age_scale"] = 0.5
+
+
+ALTERED = [
+    (flip_weight, "was altered: its contents do not fit their SHA-256"),
+    (other_discount, "was altered: its contents do not fit their SHA-256"),
+    (newer, "schema is 7; this version reads 1"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), ALTERED, ids=[change.__name__ for change, _ in ALTERED])
+def test_altered_file(run, tmp_path, change, message):
+    path = tmp_path / "mine.npz"
+    load_policy(run, **ONE).save(path)
+    rewritten(path, tmp_path / "other.npz", change)
+    with pytest.raises(PolicyError) as error:
+        load_policy(tmp_path / "other.npz")
+    assert str(error.value) == f"{tmp_path / 'other.npz'}: {message}"
+
+
+def test_truncated_flipped_and_foreign_files(run, tmp_path):
+    path = tmp_path / "mine.npz"
+    load_policy(run, **ONE).save(path)
+    whole = path.read_bytes()
+    for broken in (whole[:-40], whole[: len(whole) // 2], b"", b"not a zip"):
+        path.write_bytes(broken)
+        with pytest.raises(PolicyError, match=r"mine\.npz: cannot be read") as error:
+            load_policy(path)
+        assert "\n" not in str(error.value)
+    rng = np.random.default_rng(0)
+    for place in rng.integers(0, len(whole), 30):  # one flipped bit anywhere: refused, or nothing that matters
+        flipped = bytearray(whole)
+        flipped[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(flipped)
+        try:
+            policy = load_policy(path)
+        except PolicyError:
+            continue
+        path.write_bytes(whole)
+        jax.tree.map(assert_array_equal, policy.collection.weights, load_policy(path).collection.weights)
+    np.savez(path, x=np.zeros(3))
+    with pytest.raises(PolicyError, match="is not a file of policies"):
+        load_policy(path)
+    with pytest.raises(PolicyError, match=r"none\.npz: cannot be read"):
+        load_policy(tmp_path / "none.npz")

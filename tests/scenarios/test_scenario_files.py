@@ -1,0 +1,148 @@
+"""Layout files: what users write about their own devices."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from uavmec_jax.env.hardware import ACTIVE_POWER_W, PROCESSING_RATE_BYTES_S, STANDBY_POWER_W
+from uavmec_jax.env.params import Params
+from uavmec_jax.errors import LayoutError
+from uavmec_jax.scenarios.named_scenario import OWN, inventory_of
+from uavmec_jax.scenarios.scenario_files import inventory_text, load_inventory
+from uavmec_jax.scenarios.seeds import town
+
+EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
+ONE = """
+[[device]]
+name = "a"
+x_m = 1.0
+y_m = 1.0
+type = "Firefly"
+task = "DNN"
+capacity_j = 5e4
+"""
+
+
+def written(tmp_path, text, name="town.toml"):
+    path = tmp_path / name
+    path.write_text(text)
+    return path
+
+
+def test_degrees_become_metres_and_own_hardware_is_taken():
+    harbour = load_inventory(EXAMPLES / "harbour.toml")
+    assert harbour.names[2] == "tide gauge"
+    layout = harbour.layout
+    assert layout.device_type.tolist() == [3, 0, OWN, 2, 4, 2]
+    assert_allclose([layout.standby_power[2], layout.active_power[2], layout.processing_rate[2]], [1.2, 0.8, 9000.0])
+    assert_allclose(layout.standby_power[0], STANDBY_POWER_W[3])
+    assert_allclose(layout.active_power[0], ACTIVE_POWER_W[4, 3])
+    assert_allclose(layout.processing_rate[1], PROCESSING_RATE_BYTES_S[2, 0])
+    assert harbour.params.uav_battery_j == 1.2e6
+    assert harbour.params.n_devices == 6
+    # One degree of latitude is 111.2 km; a degree of longitude shrinks with the cosine of the latitude.
+    north = (53.5472 - 53.5430) * 111_195.0
+    east = (9.9935 - 9.9848) * 111_195.0 * np.cos(np.radians(53.543))
+    assert_allclose(harbour.params.region_m, [east, north], rtol=1e-4)
+    assert_allclose(layout.position.min(axis=0), 0.0, atol=1e-3)
+    assert_allclose(harbour.geographic(np.asarray(layout.position))[4], [9.9880, 53.5455], atol=1e-6)
+
+
+def test_toml_reads_back_to_the_same(tmp_path):
+    harbour = load_inventory(EXAMPLES / "harbour.toml")
+    again = load_inventory(written(tmp_path, inventory_text(harbour)))
+    assert again.file == harbour.file
+    jax.tree.map(assert_array_equal, again.layout, harbour.layout)
+
+
+def test_csv_reads_back_to_the_same(tmp_path):
+    village = load_inventory(EXAMPLES / "village.csv")
+    assert village.layout.has_power.tolist() == [False, False, True, False]
+    again = load_inventory(written(tmp_path, inventory_text(village, ".csv"), "village.csv"))
+    assert again.file == village.file
+    as_toml = load_inventory(written(tmp_path, inventory_text(village), "village.toml"))
+    jax.tree.map(assert_array_equal, as_toml.layout, village.layout)
+    with pytest.raises(LayoutError, match="a CSV has no place for params"):
+        inventory_text(load_inventory(EXAMPLES / "harbour.toml"), ".csv")
+
+
+def test_a_random_town_reads_back_to_the_same(tmp_path):
+    params = Params(region_m=(500.0, 300.0))
+    layout = town(4, params, 5, 7)
+    again = load_inventory(written(tmp_path, inventory_text(inventory_of(layout, params, "town"))))
+    jax.tree.map(assert_array_equal, again.layout, layout)
+    assert again.params == params
+
+
+def test_a_place_on_the_map_is_needed_for_degrees():
+    with pytest.raises(LayoutError, match="has no place on the map; give origin"):
+        load_inventory(EXAMPLES / "village.csv").geographic(np.zeros(2))
+
+
+BAD = {
+    "no device": ('name = "x"', "holds 0 devices; give 1 to 64"),
+    "outside": (ONE.replace("x_m = 1.0", "x_m = 900.0"), "device 1 (a): lies at 900, 1 m, outside the region of 800 x"),
+    "twice": (ONE + ONE, "device 2: name is 'a', which another device has"),
+    "type": (ONE.replace("Firefly", "Fireflyy"), "type is 'Fireflyy', which the tables do not know; did you mean 'Fir"),
+    "no type": (ONE.replace('type = "Firefly"', ""), "type is missing; or give standby_power_w, active_power_w"),
+    "half own": (ONE.replace("Firefly", "x") + "active_power_w = 1.0", "type is 'x', which the tables do not know"),
+    "capacity": (ONE.replace("5e4", "0"), "device 1 (a): capacity_j is 0; it should be greater than 0"),
+    "no capacity": (ONE.replace("capacity_j = 5e4", ""), "device 1 (a): capacity_j is missing"),
+    "hop": (
+        "[params]\nuav_battery_j = 10.0\n" + ONE,
+        "the hop from the start to a, 1 m, takes 0 kJ; the UAV's battery",
+    ),
+    "field": (ONE + "colour = 3", "device 1 (a): colour is not a field"),
+    "param": (
+        "[params]\nuav_batery_j = 3.0\n" + ONE,
+        "params.uav_batery_j is not a field; did you mean 'uav_battery_j'?",
+    ),
+    "place": (ONE.replace("x_m = 1.0", ""), "device 1 (a): position is unclear; give x_m and y_m, or lon and lat"),
+    "both": (ONE + "lon = 3.0\nlat = 4.0", "device 1 (a): position is unclear"),
+    "nan": (ONE.replace("x_m = 1.0", "x_m = nan"), "x_m is nan; it should be a finite number"),
+    "count": ("[params]\nn_devices = 3\n" + ONE, "params.n_devices is 3, but there are 1 devices; leave it out"),
+    "range": (
+        "[params]\ntask_volume_range_bytes = [4e6, 2e6]\n" + ONE,
+        "params.task_volume_range_bytes is [4000000.0, 2",
+    ),
+    "origin": ("origin = [9.9, 95.0]\n" + ONE, "origin.1 is 95.0; it should be less than or equal to 89"),
+    "toml": ("[[device]", "not TOML"),
+    "table": ("device = [3]", "device 1 (3): "),
+}
+
+
+@pytest.mark.parametrize(("text", "message"), BAD.values(), ids=BAD)
+def test_bad_inventory_is_one_clear_line(tmp_path, text, message):
+    with pytest.raises(LayoutError) as error:
+        load_inventory(written(tmp_path, text))
+    assert message in str(error.value)
+    assert str(error.value).startswith(str(tmp_path / "town.toml"))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "name,x_m,y_m,type,task,capacity_j\na,1,2,Firefly,DNN,abc\n",
+            "capacity_j is 'abc'; it should be a valid number",
+        ),
+        ("name,x_m,y_m,type,task,capacity_j,power\na,1,2,Firefly,DNN,5,maybe\n", "power is 'maybe'"),
+        ("name,x_m\na,1,2,3\n", "device 1 (a): "),
+        ("", "holds 0 devices"),
+    ],
+)
+def test_bad_csv_is_one_clear_line(tmp_path, text, message):
+    with pytest.raises(LayoutError) as error:
+        load_inventory(written(tmp_path, text, "town.csv"))
+    assert message in str(error.value)
+
+
+def test_files_that_are_none(tmp_path):
+    with pytest.raises(LayoutError, match=r"cannot be read: No such file"):
+        load_inventory(tmp_path / "none.toml")
+    with pytest.raises(LayoutError, match=r"ends in .toml or .csv"):
+        load_inventory(tmp_path / "none.json")

@@ -1,0 +1,201 @@
+"""Studies of drawn scenarios: what a file may say, how agents are judged, and that a policy of one plays anywhere."""
+
+import jax
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from tests.experiments.scripts import run as run_script
+from tests.populations import take
+from uavmec_jax.agents import collect_rollout as experience
+from uavmec_jax.agents import on_policy, ppo
+from uavmec_jax.agents.algorithm import AGENTS_AXIS
+from uavmec_jax.env.dynamics import initial_state
+from uavmec_jax.env.layout import sample_layout
+from uavmec_jax.env.params import Params
+from uavmec_jax.errors import PolicyError, StudyError
+from uavmec_jax.runs.run import run_study
+from uavmec_jax.scenarios.distribution import unlike
+from uavmec_jax.scenarios.policies import load_policy
+from uavmec_jax.studies.population import evaluation_keys, identities, make_agents, validation_keys
+from uavmec_jax.studies.study import load_study, parse_study, study_toml
+
+TOML = """
+algorithm = "ppo"
+steps = 64
+reward = {}
+slot_reward = 0.1
+[axes]
+seeds = 2
+[scenarios]
+devices = [2, 6]
+typical_devices = 5
+typical_least = 2
+[params]
+n_devices = 6
+[ppo]
+observation = "full"
+hidden = [8]
+n_envs = 4
+n_steps = 8
+batch_size = 16
+n_epochs = 1
+[evaluation]
+draws = 6
+validate_every = 32
+validation_draws = 4
+baselines = ["oldest-first"]
+planners = []
+"""
+
+
+def study_of(text=TOML, **overrides):
+    return parse_study(text, "mine.toml", overrides)
+
+
+def test_all_agents_are_judged_in_the_same_scenarios():
+    study = study_of()
+    assert identities(study) == [{"seed": 0, "scenarios": "drawn"}, {"seed": 1, "scenarios": "drawn"}]
+    for keys in (validation_keys(study), evaluation_keys(study)):
+        first, second = jax.random.key_data(keys)
+        assert_array_equal(first, second)
+    one, other = jax.random.key_data(make_agents(study).key)
+    assert (one != other).any()
+
+
+def test_a_study_reads_back_to_itself():
+    study = study_of()
+    assert parse_study(study_toml(study), "again.toml") == study
+    assert load_study("generalist").scenarios.places == ("albany", "round_lake")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        (
+            "devices = [2, 6]",
+            "devices = [2, 7]",
+            "scenarios.devices is [2.0, 7.0]; give [low, high] with 2 <= low <= high <= 6",
+        ),
+        (
+            "devices = [2, 6]",
+            "devices = [2, 6]\npowered = [0.5, 1.2]",
+            "scenarios.powered is [0.5, 1.2]; give [low, high] with 0 <= low",
+        ),
+        (
+            "devices = [2, 6]",
+            "devices = [2, 6]\nregion_m = [0.0, 9.0]",
+            "scenarios.region_m is [0.0, 9.0]; give [low, high] with 0 < low",
+        ),
+        ("devices = [2, 6]", "devices = [2, 6]\nuav_factor = [2.0, 1.0]", "scenarios.uav_factor is [2.0, 1.0]"),
+        ("typical_least = 2", "typical_least = 9", "scenarios.typical_least is 9; typical_devices is the most"),
+        ("typical_least = 2", "typical = 1.5", "scenarios.typical is 1.5"),
+        ("typical_least = 2", "devises = 1", "did you mean 'devices'?"),
+        (
+            "typical_devices = 5",
+            "typical_devices = 7",
+            "scenarios.typical_devices is 7; params.n_devices, 6, is the most",
+        ),
+        ("seeds = 2", "seeds = 2\npowered = [4]", "axes.powered is given, and scenarios too"),
+        ('algorithm = "ppo"', 'algorithm = "dqn"', "algorithm is 'dqn', which plays one scenario"),
+        ("steps = 64", 'steps = 64\nplace = "albany"', "place is given, and scenarios too"),
+        ('observation = "full"', 'observation = "all"', "ppo.observation is 'all'"),
+    ],
+)
+def test_what_does_not_fit_is_one_line(old, new, words):
+    text = TOML.replace(old, new)
+    if "dqn" in new:
+        text = text[: text.index("[ppo]")] + text[text.index("[evaluation]") :]
+    with pytest.raises(StudyError) as told:
+        study_of(text)
+    assert words in str(told.value)
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.slow
+def test_an_episode_that_ends_is_followed_by_one_in_a_fresh_scenario():
+    """Where an episode ended the town is another one, the others go on in theirs."""
+    study = study_of()
+    agent = take(make_agents(study), 0)
+    spec = ppo.PPOSpec(hidden=(8,), observation="full", n_envs=16, n_steps=1, n_devices=6, batch_size=16)
+    state = on_policy.init(spec, ppo._OPTIMIZER, agent)
+    play = jax.jit(jax.vmap(lambda state, key: experience.play(spec, agent, state, key), axis_name=AGENTS_AXIS))
+    some_ended = False
+    for number in range(16):
+        key = jax.random.key(number)[None]
+        after, samples = play(jax.tree.map(lambda leaf: leaf[None], state), key)
+        after = take(after, 0)
+        begun = np.asarray(after.worlds.slot) == 0
+        moved = (np.asarray(after.scenarios.layout.position) != np.asarray(state.scenarios.layout.position)).any((1, 2))
+        assert_array_equal(begun, moved)
+        assert np.isfinite(np.asarray(samples.observation)).all()
+        present = np.take_along_axis(
+            np.asarray(state.scenarios.layout.present), np.asarray(samples.action)[0][:, None], 1
+        )
+        assert present.all()
+        some_ended |= begun.any()
+        state = after
+    assert some_ended
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("drawn") / "run"
+    return run_study(study_of(), folder), folder
+
+
+@pytest.mark.slow
+def test_a_run_is_judged_and_read_back(run):
+    results, _ = run
+    assert results.run["complete"]
+    assert results.agents["scenarios"].tolist() == ["drawn", "drawn"]
+    assert results.evaluation["best/lifetime"].shape == (2, 7)
+    oldest = results.evaluation["oldest_first/lifetime"]
+    assert_array_equal(oldest[0], oldest[1])
+    assert (results.agents["best_validation"] <= results.agents["best_validation"].max()).all()
+    assert results.cells()["seeds"].tolist() == [2]
+
+
+@pytest.mark.slow
+def test_its_policies_play_any_number_of_devices(run):
+    _, folder = run
+    with pytest.raises(PolicyError, match="they differ in seed"):
+        load_policy(folder)
+    policy = load_policy(folder, seed=1)
+    for n in (3, 12):
+        params = Params(n_devices=n)
+        layout = sample_layout(jax.random.key(n), params, 1, 1)
+        assert 0 <= int(policy(params, layout, initial_state(params, layout))) < n
+
+
+def test_what_is_unlike_the_training_is_named():
+    study = load_study("generalist")
+    scenarios, trained = study.scenarios.model_dump(), study.params.model_dump()
+    params = Params()
+    layout = sample_layout(jax.random.key(0), params, 8, 8)
+    assert unlike(scenarios, trained, params, layout) == []
+    far = Params(n_devices=40, data_age_limit_slots=20, uav_speed_m_s=9.0, region_m=(9000.0, 9000.0))
+    found = unlike(scenarios, trained, far, sample_layout(jax.random.key(0), far, 8, 8))
+    named = [line.split(":")[0] for line in found]
+    assert named == ["devices", "extent in m", "the UAV's speed in m/s", "data_age_limit_slots"]
+    assert found[0] == "devices: 40; it was trained on 4 to 16"
+    assert found[-1] == "data_age_limit_slots: 20; it was trained on 10"
+
+
+@pytest.mark.slow
+def test_the_paper_s_observation_learns_on_drawn_scenarios_too():
+    """Nothing ties drawn scenarios to the full observation: a network of the paper's words takes layouts of one size."""
+    study = study_of(TOML.replace('observation = "full"', 'observation = "paper"'), **{"axes.seeds": 1})
+    results = run_study(study)
+    assert_allclose(results.agents["diverged_at"], -1)
+
+
+@pytest.mark.slow
+def test_its_best_policy_is_shipped(run, tmp_path):
+    """The script that ships the generalist does not train a run again that is there: here a tiny one."""
+    results, folder = run
+    out = run_script("ship_generalist.py", "--run", folder, "--into", tmp_path / "mine.npz")
+    assert "mine.npz" in out
+    shipped = load_policy(tmp_path / "mine.npz")
+    assert shipped.n_devices is None
+    assert shipped.trained_on["seed"] == results.agents["best_validation"].idxmax()

@@ -1,0 +1,182 @@
+"""One time slot of the network: a pure function of explicit task volumes (paper, sections 3.1 and 4)."""
+
+import enum
+import math
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
+
+from uavmec_jax.env.layout import Layout
+from uavmec_jax.env.params import Params
+
+
+class Cause(enum.IntEnum):
+    """Why an episode ended."""
+
+    NONE = 0
+    """It goes on."""
+    BATTERY = 1
+    """A device's battery is empty (constraint 1e)."""
+    DATA_AGE = 2
+    """A device's data are too old (constraint 1g)."""
+    UAV = 3
+    """The UAV's battery does not cover the next slot."""
+
+
+@struct.dataclass
+class State:
+    """What changes from slot to slot.
+
+    Attributes:
+        battery: ``[n]`` J left in each device.
+        age: ``[n]`` int32, slots since each device's data last got out.
+        uav_position: ``[2]`` m.
+        uav_energy: J left in the UAV.
+        slot: int32, slots completed.
+        elapsed: s, length of the slots completed.
+    """
+
+    battery: Any
+    age: Any
+    uav_position: Any
+    uav_energy: Any
+    slot: Any
+    elapsed: Any = 0.0
+
+
+@struct.dataclass
+class Outcome:
+    """What one slot did.
+
+    Attributes:
+        cause: int32, a :class:`Cause`.
+        failed: ``[n]`` bool, every device that failed in this slot.
+        served: ``[n]`` bool, the devices within range of the hover point.
+        duration: s, length of the slot (0 if it never started).
+        first_failure: ``[n]`` f32, share of each device in the first failure, summing to 1 if a device failed:
+            all of it on the battery that runs out earliest inside the slot; expired data share equally.
+    """
+
+    cause: Any
+    failed: Any
+    served: Any
+    duration: Any
+    first_failure: Any
+
+
+def initial_state(params: Params, layout: Layout) -> State:
+    """Full batteries, fresh data, the UAV with a full battery in the origin corner."""
+    return State(
+        battery=jnp.asarray(layout.capacity, jnp.float32),
+        age=jnp.zeros(layout.capacity.shape, jnp.int32),
+        uav_position=jnp.zeros((2,), jnp.float32),
+        uav_energy=jnp.asarray(params.uav_battery_j, jnp.float32),
+        slot=jnp.zeros((), jnp.int32),
+        elapsed=jnp.zeros((), jnp.float32),
+    )
+
+
+def slots_to_expiry(params: Params) -> Any:
+    """Slots without service after which fresh data have expired: 11 with the paper's limit of 10."""
+    return jnp.where(params.age_at_limit_fails, params.data_age_limit_slots, params.data_age_limit_slots + 1)
+
+
+def upload_rate(params: Params, slant_distance_m: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Shannon rate of an upload to the UAV, bit/s (paper, equation 4); every served device has the full band."""
+    gain = params.reference_gain * jnp.exp(-params.path_loss_exponent * jnp.log(slant_distance_m))
+    snr = params.transmit_power_w * gain / params.noise_power_w
+    return params.bandwidth_hz * _log1p(snr) / math.log(2.0)
+
+
+def _log1p(x: Float[Array, " n"]) -> Float[Array, " n"]:
+    """``log(1 + x)`` of ``x >= 0``, relative error below 3e-7; XLA's own costs as much as the rest of the slot.
+
+    Small arguments go through the series of ``2 artanh(x / (2 + x))``.
+    """
+    z = x / (2.0 + x)
+    square = z * z
+    series = 2.0 * z * (1.0 + square * (1 / 3 + square * (1 / 5 + square * (1 / 7))))
+    return jnp.where(x < 0.25, series, jnp.log(1.0 + x))
+
+
+def transition(
+    params: Params, layout: Layout, state: State, action: Int[ArrayLike, ""], volumes: Num[Array, " n"]
+) -> tuple[State, Outcome]:
+    """Fly to a device, serve everyone in range, let the others compute, and see who is still alive.
+
+    Args:
+        params: scenario parameters.
+        layout: the devices.
+        state: before the slot.
+        action: int in ``[0, n)``, the device to visit; staying is allowed. (Out of range is clamped, as JAX indexes.)
+        volumes: ``[n]`` bytes, the task of each device in this slot.
+
+    Returns:
+        The state after the slot and its :class:`Outcome`. If the UAV cannot pay for the slot nothing happens in it.
+    """
+    hover_point = layout.position[action]
+    t_fly = jnp.linalg.norm(hover_point - state.uav_position) / params.uav_speed_m_s
+    ground = layout.position - hover_point
+    slant = jnp.sqrt(jnp.sum(ground**2, axis=-1) + params.uav_altitude_m**2)
+    served = (slant <= params.uav_signal_range_m) | (jnp.arange(layout.capacity.shape[0]) == action)
+
+    t_upload = 8.0 * volumes / upload_rate(params, slant)
+    t_compute = jnp.minimum(volumes / layout.processing_rate, params.slot_cap_s)
+    t_results = jnp.where(layout.has_comms, 8.0 * params.result_message_bytes / params.uplink_rate_bit_s, 0.0)
+    duration = jnp.max(jnp.where(served, t_fly + t_upload, t_compute + t_results))
+
+    t_hover = duration - jnp.where(params.flight_power_adds_to_hover, 0.0, t_fly)
+    uav_cost = params.uav_flying_power_w * t_fly + params.uav_hovering_power_w * t_hover
+    starts = state.uav_energy >= uav_cost
+
+    work = jnp.where(
+        served,
+        params.transmit_power_w * t_upload,
+        layout.active_power * t_compute + params.transmit_power_w * t_results,
+    )
+    drain = jnp.where(layout.has_power, 0.0, layout.standby_power * duration + work)
+    after = State(
+        battery=jnp.maximum(state.battery - drain, 0.0),
+        age=jnp.where(served, 0, state.age + jnp.where(layout.has_comms, 0, 1)),
+        uav_position=hover_point,
+        uav_energy=state.uav_energy - uav_cost,
+        slot=state.slot + 1,
+        elapsed=state.elapsed + duration,
+    )
+    unstarted = replace(state, slot=state.slot + jnp.where(params.count_unfinished_slot, 1, 0))
+    after = jax.tree.map(lambda played, kept: jnp.where(starts, played, kept), after, unstarted)
+    empty = starts & (after.battery <= 0.0)
+    return after, _outcome(params, state, after, starts, served, duration, drain, empty)
+
+
+def _outcome(
+    params: Params,
+    before: State,
+    after: State,
+    starts: Bool[Array, ""],
+    served: Bool[Array, " n"],
+    duration: Float[Array, ""],
+    drain: Float[Array, " n"],
+    empty: Bool[Array, " n"],
+) -> Outcome:
+    """Check the failures after the slot: an empty battery outranks expired data."""
+    expired = starts & (after.age >= slots_to_expiry(params))
+    cause = jnp.where(
+        starts,
+        jnp.where(jnp.any(empty), Cause.BATTERY, jnp.where(jnp.any(expired), Cause.DATA_AGE, Cause.NONE)),
+        Cause.UAV,
+    )
+    # Mean power over the slot is drain / duration, so the part of the slot a battery lasts is battery / drain.
+    lasts = jnp.where(empty, before.battery / jnp.where(empty, drain, 1.0), jnp.inf)
+    first = jnp.where(jnp.any(empty), empty & (lasts <= jnp.min(lasts)), expired)
+    return Outcome(
+        cause=cause.astype(jnp.int32),
+        failed=empty | expired,
+        served=served & starts,
+        duration=jnp.where(starts, duration, 0.0),
+        first_failure=first / jnp.maximum(jnp.sum(first), 1),
+    )

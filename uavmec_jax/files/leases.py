@@ -1,0 +1,212 @@
+"""Who works on what in a folder that several processes and hosts share.
+
+A lease is a numbered file. To claim, a process creates the next number, which only one can; the highest number holds.
+The holder writes a new beat into its file every few seconds. Others take over when the holder is known to be dead (its
+process is gone on this very machine), when it has let go, or when they have seen no new beat for the lease's whole
+time by their own monotonic clock; so neither clocks that differ nor clocks that jump matter. A holder that was only
+asleep finds a higher number and stops (Gray and Cheriton, 1989; the number is a fencing token).
+"""
+
+import json
+import os
+import socket
+import threading
+import time
+import uuid
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from uavmec_jax.errors import StudyError
+from uavmec_jax.files.reading import read_facts
+from uavmec_jax.files.writing import whole
+
+LEASE_S = 60.0
+"""Seconds without a beat after which a holder on another machine counts as dead."""
+
+_BEATS_PER_LEASE = 6
+
+
+class LeaseLostError(StudyError):
+    """Somebody else has taken over."""
+
+
+def this_machine() -> str:
+    """Host name and an identity of the running system: a name alone may be that of another machine."""
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+    except OSError:
+        boot = f"{uuid.getnode():x}"
+    return f"{socket.gethostname()} {boot}"
+
+
+def named(holder: dict[str, Any]) -> str:
+    """A holder in words."""
+    return f"process {holder.get('pid', '?')} on {str(holder.get('machine', 'an unknown machine')).split()[0]}"
+
+
+@dataclass
+class Lease:
+    """A claim that is held. A thread of its own writes the beats.
+
+    Attributes:
+        folder: what is claimed.
+        number: of the claim.
+        lease_s: seconds without a beat after which it is lost.
+        news: facts that each beat tells besides: progress.
+    """
+
+    folder: Path
+    number: int
+    lease_s: float
+    news: dict[str, Any] = field(default_factory=dict)
+    _beats: int = 0
+    _ended: threading.Event = field(default_factory=threading.Event)
+    _writing: threading.Lock = field(default_factory=threading.Lock)
+
+    def __post_init__(self) -> None:
+        self._thread = threading.Thread(target=self._beat_on, daemon=True, name=f"lease {self.folder.name}")
+        self._thread.start()
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return _file(self.folder, self.number)
+
+    def check(self) -> None:
+        """Go on only as the holder.
+
+        Raises:
+            LeaseLostError: somebody else has taken over.
+        """
+        if _file(self.folder, self.number + 1).exists() or not self.path.exists():
+            raise LeaseLostError(f"{self.folder}: {named(read_lease(self.folder))} has taken over")
+
+    def release(self) -> None:
+        """Let go: whoever comes next need not wait."""
+        self._ended.set()
+        self._thread.join()
+        self._write(released=True)
+
+    def _beat_on(self) -> None:
+        while not self._ended.wait(self.lease_s / _BEATS_PER_LEASE):
+            self._write()
+
+    def _write(self, **facts: Any) -> None:
+        with self._writing:
+            self._beats += 1
+            text = json.dumps(_facts() | {"beat": self._beats} | self.news | facts)
+            try:
+                with whole(self.path) as partial:
+                    partial.write_text(text, encoding="utf-8")
+            except OSError:  # a full disk, a server that is away: others may take over, and `check` then tells
+                return
+
+
+class Leases:
+    """Claims leases, and remembers the beats that it has seen of others."""
+
+    def __init__(self, lease_s: float = LEASE_S) -> None:
+        self.lease_s = lease_s
+        self._seen: dict[Path, tuple[bytes, float]] = {}
+
+    def claim(self, folder: Path) -> Lease | None:
+        """Claim a folder; ``None`` if somebody holds it."""
+        latest = _latest(folder)
+        if latest and self.holder(folder) is not None:
+            return None
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            with _file(folder, latest + 1).open("x", encoding="utf-8") as file:
+                file.write(json.dumps(_facts() | {"beat": 0}))
+        except FileExistsError:
+            return None
+        return Lease(folder, latest + 1, self.lease_s)
+
+    def holder(self, folder: Path) -> dict[str, Any] | None:
+        """Who holds a folder, as far as this process can tell by now; ``None`` if nobody does."""
+        latest = _latest(folder)
+        if not latest:
+            return None
+        path = _file(folder, latest)
+        try:
+            content = path.read_bytes()
+        except OSError:
+            content = b""
+        now = time.monotonic()
+        before, since = self._seen.get(path, (None, now))
+        if content != before:
+            self._seen[path] = (content, now)
+            since = now
+        holder = read_facts(path)
+        dead = _is_known_dead(holder) or holder.get("released") or now - since > self.lease_s
+        return None if dead else holder
+
+    def hold(self, folder: Path, of: Path, more: str = "") -> Lease:
+        """Claim a folder, or refuse; a holder on another machine that may be dead is watched for as long as it takes.
+
+        Args:
+            folder: what is claimed.
+            of: what it is the folder of, for the message.
+            more: said after it.
+
+        Raises:
+            StudyError: somebody holds it, and is alive.
+        """
+        first: dict[str, Any] | None = None
+        while (lease := self.claim(folder)) is None:
+            holder = self.holder(folder)
+            if holder is None:
+                continue
+            first = holder if first is None else first
+            if holder.get("machine") == this_machine() or holder.get("beat") != first.get("beat"):
+                raise StudyError(f"{of}: {named(holder)} is at work in it{more}")
+            time.sleep(min(1.0, self.lease_s / 4))
+        return lease
+
+    def taken_over(self, folder: Path) -> bool:
+        """Whether a claim would not be the first one."""
+        return _latest(folder) > 0
+
+
+def _is_known_dead(holder: dict[str, Any]) -> bool:
+    """Whether the process was one of this machine, and is gone, or its number has gone to another one."""
+    if holder.get("machine") != this_machine():
+        return False
+    pid = holder.get("pid", -1)
+    return not psutil.pid_exists(pid) or holder.get("born") != _born(pid)
+
+
+def _born(pid: int) -> str | None:
+    """When a process was started, in ticks since the machine was: no clock can change it. ``None`` beyond Linux."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[19]
+    except (OSError, IndexError):
+        return None
+
+
+def _facts() -> dict[str, Any]:
+    pid = os.getpid()
+    return {"machine": this_machine(), "pid": pid, "born": _born(pid), "at": time.time()}
+
+
+def _file(folder: Path, number: int) -> Path:
+    return folder / f"lease-{number:04d}.json"
+
+
+def _latest(folder: Path) -> int:
+    """The highest claim, 0 if there is none."""
+    return max((int(path.stem.removeprefix("lease-")) for path in folder.glob("lease-[0-9]*.json")), default=0)
+
+
+def read_lease(folder: Path) -> dict[str, Any]:
+    """What the latest claim's file says, whether it still holds or not; empty if there is none."""
+    latest = _latest(folder)
+    return read_facts(_file(folder, latest)) if latest else {}
+
+
+def is_quiet(lease: dict[str, Any], lease_s: float) -> bool:
+    """Whether the holder is gone, as far as one look can tell: for display, by the clocks of both machines."""
+    return bool(_is_known_dead(lease) or lease.get("released") or time.time() - lease.get("at", 0) > lease_s)

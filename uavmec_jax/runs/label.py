@@ -1,0 +1,30 @@
+"""The label of a run: what is known of it before it starts."""
+
+import datetime
+import sys
+from dataclasses import asdict
+from typing import Any
+
+from uavmec_jax.runs.run_plan import Plan
+from uavmec_jax.studies.places import describe_places
+from uavmec_jax.studies.population import seeds_of
+from uavmec_jax.studies.results import SCHEMA
+from uavmec_jax.studies.schema import Study
+from uavmec_jax.training import host
+
+
+def label_of(study: Study, plan: Plan, command: str | None) -> dict[str, Any]:
+    """What is known of a run before it starts, for ``run.json``."""
+    return {
+        "schema": SCHEMA,
+        "study": study.name,
+        "command": command or " ".join(sys.argv),
+        "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "complete": False,
+        "agents": plan.agents,
+        "seeds": seeds_of(study),
+        **({"places": places} if (places := describe_places(study)) else {}),
+        "workers": plan.workers,
+        "blocks": {name: asdict(blocks) for name, blocks in plan.blocks.items()},
+        **host.describe(),
+    }

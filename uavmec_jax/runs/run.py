@@ -1,0 +1,215 @@
+"""Run a study: in this process or by several, in one go or taken up again; and put together what they left."""
+
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from uavmec_jax.errors import StudyError
+from uavmec_jax.files.leases import Leases
+from uavmec_jax.runs.folder import PLAN, SHARDS, Durability, RunFolder
+from uavmec_jax.runs.label import label_of
+from uavmec_jax.runs.log import writer_class
+from uavmec_jax.runs.results_folder import (
+    check_directory,
+    check_empty,
+    help_with,
+    load_results,
+    partial_results,
+    put_together,
+    sound_shards,
+)
+from uavmec_jax.runs.run_plan import Plan, plan_study
+from uavmec_jax.runs.shard_runner import Bench
+from uavmec_jax.runs.signals import Stop
+from uavmec_jax.runs.team import work_together
+from uavmec_jax.runs.worker import OnEvent, OnProgress, make_worker
+from uavmec_jax.studies.results import Results
+from uavmec_jax.studies.schema import Study
+from uavmec_jax.studies.shard_result import Finished
+from uavmec_jax.training.population import Progress
+
+RewardFunction = Callable[[Mapping[str, Any]], Any]
+
+
+def run_study(
+    study: Study,
+    directory: str | Path | None = None,
+    *,
+    reward: RewardFunction | None = None,
+    command: str | None = None,
+    workers: int = 1,
+    shard_size: int | None = None,
+    durability: Durability | None = None,
+    on_progress: OnProgress = lambda _: None,
+    on_event: OnEvent = lambda event, facts: None,
+) -> Results:
+    """Train and judge the population of a study.
+
+    In a directory the run survives whatever happens: see :func:`resume_run`. Ctrl-C or SIGTERM end it early; the results
+    then hold the finished shards, ``run["complete"]`` is False and ``run["stopped_by"]`` is the signal's number.
+
+    Args:
+        study: from :func:`uavmec_jax.studies.study.load_study`.
+        directory: where to save; ``None`` saves nothing.
+        reward: a function of the terms (see :func:`um.make_reward`) in place of the study's reward; the run's label
+            then names it.
+        command: the command line, for the label of the results.
+        workers: processes; more than one need a directory.
+        shard_size: most agents in a shard; by default what the devices' caches hold.
+        durability: how the run is kept.
+        on_progress: told after every chunk.
+        on_event: told ``(event, facts)`` of everything that is logged.
+
+    Raises:
+        StudyError: the population does not fit, the directory cannot take a run or somebody is at work in it, shards
+            have failed, ``reward`` stands beside an axis of rewards, or tensorboardX is wanted and not installed.
+    """
+    if reward is not None and "reward" in study.axes:
+        raise StudyError(f"{study.name}: axes.reward is given, and a reward function too; leave one of them out")
+    if workers > 1 and (directory is None or reward is not None):
+        raise StudyError(
+            f"{study.name}: workers is {workers}; several processes need a directory and no reward function"
+        )
+    if directory is not None:
+        check_directory(Path(directory))
+    plan = plan_study(study, workers=workers, shard_size=shard_size)
+    label = label_of(study, plan, command)
+    if reward is not None:
+        label["reward_function"] = getattr(reward, "__qualname__", repr(reward))
+    bench = Bench(study, plan, reward)
+    if directory is None:
+        return _run_in_memory(study, plan, bench, label, on_progress)
+    path = Path(directory)
+    durability = durability or Durability()
+    if durability.tensorboard:
+        writer_class()
+    lease = Leases(durability.lease_s).hold(path / SHARDS, path, help_with(path))
+    try:
+        check_empty(path)
+        RunFolder.create(path, study, plan, durability, label)
+        return _run(path, bench, workers, on_progress, on_event)
+    finally:
+        lease.release()
+
+
+def resume_run(
+    directory: str | Path,
+    *,
+    reward: RewardFunction | None = None,
+    workers: int | None = None,
+    other_code: bool = False,
+    on_progress: OnProgress = lambda _: None,
+    on_event: OnEvent = lambda event, facts: None,
+) -> Results:
+    """Go on with a run that was stopped or killed; it ends with the bits of a run that was not.
+
+    Finished shards are kept, the others go on from their last sound snapshot; shards that failed are tried again.
+
+    Args:
+        directory: of the run.
+        reward: the function that the run was started with, if it was.
+        workers: processes; by default as many as the run was planned for.
+        other_code: go on although code or libraries are not those that planned the run; its label then says so.
+        on_progress: told after every chunk.
+        on_event: told ``(event, facts)`` of everything that is logged.
+
+    Raises:
+        StudyError: the directory holds no run, its plan is damaged, somebody is at work in it, it needs its reward
+            function or was planned by other code.
+    """
+    path = Path(directory)
+    folder = RunFolder.open(path)
+    folder.check_reward(reward)
+    if folder.complete:
+        shutil.rmtree(folder.shards_folder, ignore_errors=True)
+        return load_results(path)
+    if not other_code:
+        folder.check_code()
+    lease = Leases(folder.durability.lease_s).hold(folder.shards_folder, path, help_with(path))
+    try:
+        for shard in folder.plan.shards:
+            folder.failure(shard).unlink(missing_ok=True)
+        label = {"other_code": differ} if (differ := folder.other_code()) else {}
+        bench = Bench(folder.study, folder.plan, reward)
+        return _run(path, bench, workers or folder.plan.workers, on_progress, on_event, label)
+    finally:
+        lease.release()
+
+
+def run_or_resume(
+    study: Study, directory: str | Path, *, command: str | None = None, on_progress: OnProgress = lambda _: None
+) -> Results:
+    """Run a study in a folder, or go on with the run that is there; one that is complete is read."""
+    if (Path(directory) / PLAN).exists():
+        return resume_run(directory, on_progress=on_progress)
+    return run_study(study, directory, command=command, on_progress=on_progress)
+
+
+def _run(
+    path: Path,
+    bench: Bench,
+    workers: int,
+    on_progress: OnProgress,
+    on_event: OnEvent,
+    label: Mapping[str, Any] = MappingProxyType({}),
+) -> Results:
+    """Work until all shards are finished, and put the results together."""
+    with Stop() as stop:
+        worker = make_worker(path, bench=bench, stop=stop, on_progress=on_progress, on_event=on_event)
+        folder = worker.folder
+        stopped: KeyboardInterrupt | None = None
+        try:
+            while True:
+                if workers > 1:
+                    work_together(folder, workers, stop, on_progress, worker.log.tell)
+                else:
+                    worker.work()
+                finished, damaged = sound_shards(folder, worker.log.tell)
+                if not damaged:
+                    break
+                worker.forget(damaged)
+        except KeyboardInterrupt as order:
+            stopped = order
+        finally:
+            worker.log.close()
+        if stopped is not None:
+            results = partial_results(folder)
+            results.run["stopped_by"] = getattr(stopped, "signal", 2)
+            return results
+        failed = [(shard, facts) for shard, state, facts in folder.states() if state == "failed"]
+        if failed:
+            shard, facts = failed[0]
+            raise StudyError(
+                f"{path}: {len(failed)} of {len(folder.plan.shards)} shards failed, shard {shard.number} with "
+                f"{facts.get('error', 'an unknown error')} ({folder.failure(shard)}); `uavmec resume {path}` tries them again"
+            )
+        return put_together(folder, finished, **label)
+
+
+def _run_in_memory(study: Study, plan: Plan, bench: Bench, label: dict, on_progress: OnProgress) -> Results:
+    """Train and judge shard after shard in this process, keeping nothing."""
+    finished: list[Finished] = []
+    steps_before = 0
+    interrupted = False
+    try:
+        for shard in plan.shards:
+            tick = time.perf_counter()
+            training = bench.start(shard)
+            while training is not None and not training.finished:
+                training.advance()
+                steps = steps_before + shard.agents * training.steps
+                on_progress(Progress(shard.number, steps, plan.work, training.mean_length))
+            finished.append(bench.finish(shard, training))
+            finished[-1].seconds["wall"] = time.perf_counter() - tick
+            steps_before += plan.work_of(shard)
+            if training is None:
+                on_progress(Progress(shard.number, steps_before, plan.work, float("nan")))
+    except KeyboardInterrupt:
+        interrupted = True
+    results = Results.of(study, label, finished, plan.agents)
+    if interrupted:
+        results.run["stopped_by"] = 2
+    return results

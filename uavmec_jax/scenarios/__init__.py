@@ -1,0 +1,1 @@
+"""What a user hands in: scenarios, states, places and policies, with the schemas of their files."""

@@ -1,0 +1,245 @@
+"""Search spaces: files that say what is searched, on which towns, and when a trial is given up."""
+
+import itertools
+import json
+import math
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pydantic
+from pydantic import Field
+
+from uavmec_jax.agents.registry import ALGORITHMS
+from uavmec_jax.env.rewards import REWARDS, TERMS
+from uavmec_jax.errors import StudyError
+from uavmec_jax.files.reading import parse_toml, read_text
+from uavmec_jax.files.validation import Strict, nearest, one_line, wanted
+from uavmec_jax.studies.population import seeds_of
+from uavmec_jax.studies.schema import Study
+from uavmec_jax.studies.study import load_study
+
+_LIBRARY = resources.files("uavmec_jax.search") / "library"
+
+REWARD = "reward."
+"""Before the name of a term, for its weight in the reward."""
+
+
+class Range(Strict):
+    """Numbers between two bounds."""
+
+    low: float | int
+    high: float | int
+    log: bool = False
+    """Equal shares for equal ratios."""
+
+
+class Choices(Strict):
+    """Some values."""
+
+    choices: Annotated[list[Any], Field(min_length=2)]
+
+
+class Towns(Strict):
+    """Where trials are judged: towns of their own, never those that the study reports."""
+
+    seeds: Annotated[int, Field(ge=1, le=1000)] = 2
+    first_seed: Annotated[int, Field(ge=0, lt=2**30)] = 1_000_000
+    cells: list[tuple[int, int]] | None = None
+    """Pairs of powered and connected devices; by default those of the study."""
+    draws: Annotated[int, Field(ge=1, le=1000)] = 32
+
+
+class Halving(Strict):
+    """Successive halving (Jamieson and Talwalkar, 2016) within a batch."""
+
+    rungs: list[Annotated[float, Field(gt=0, lt=1)]] = Field(default_factory=list)
+    """Shares of the training at which the worst trials are given up; none gives up nobody."""
+    keep: Annotated[float, Field(gt=0, lt=1)] = 0.5
+    """Share of the trials that goes on."""
+
+
+class Space(Strict):
+    """A search."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=80)] = "search"
+    study: str
+    """Whose settings are searched: a shipped study or a file."""
+    change: dict[str, Any] = Field(default_factory=dict)
+    """Settings of the study that are others here, by dotted names."""
+    trials: Annotated[int, Field(ge=1, le=100_000)] = 64
+    batch: Annotated[int, Field(ge=1, le=4096)] = 16
+    """Trials that train together."""
+    objective: Literal["mean", "low"] = "mean"
+    """Mean lifetime of the best weights, or the lower end of its 95 % interval over the towns."""
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    validation: Towns = Towns()
+    halving: Halving = Halving()
+    confirm_seeds: Annotated[int, Field(ge=0, le=1000)] = 5
+    """Towns of the study (its seeds, from 0) on which the best settings are then held against the study's own; 0: none."""
+    space: dict[str, Range | Choices]
+    """A hyperparameter, ``reward.TERM``, or, of choices, a setting that shapes the program."""
+
+    def base(self) -> Study:
+        """The study with this search's changes.
+
+        Raises:
+            StudyError: it is not one of a single algorithm, or the changes do not fit.
+        """
+        study = load_study(self.study, self.change)
+        if len(study.algorithms) != 1:
+            raise StudyError(f"{self.name}: study {self.study!r} trains {len(study.algorithms)} algorithms; search one")
+        more = [axis for axis in study.axes if axis not in ("powered", "connected", "cells", "seeds")]
+        if more:
+            raise StudyError(f"{self.name}: study {self.study!r} has the axis {more[0]}; search one setting of it")
+        return study
+
+
+def shipped_spaces() -> dict[str, Any]:
+    """Spaces inside the package: name -> file."""
+    return {Path(file.name).stem: file for file in _LIBRARY.iterdir() if file.name.endswith(".toml")}
+
+
+def load_space(name_or_path: str, overrides: Mapping[str, Any] | None = None) -> Space:
+    """A space that ships with the package, or a file.
+
+    Raises:
+        StudyError: it is missing, is not TOML, or holds something that does not fit; one line.
+    """
+    library = shipped_spaces()
+    if name_or_path in library:
+        text = library[name_or_path].read_text(encoding="utf-8")
+    elif not Path(name_or_path).is_file():
+        known = nearest(Path(name_or_path).stem, library)
+        raise StudyError(f"{name_or_path}: neither a file of a search space nor a shipped one; {known}")
+    else:
+        text = read_text(Path(name_or_path), StudyError)
+    data = {"name": Path(name_or_path).stem} | parse_toml(text, name_or_path, StudyError) | dict(overrides or {})
+    if isinstance(data.get("validation"), dict) and isinstance(data["validation"].get("cells"), list):
+        cells = data["validation"]["cells"]
+        data["validation"] = data["validation"] | {"cells": [tuple(c) if isinstance(c, list) else c for c in cells]}
+    try:
+        space = Space.model_validate(data)
+    except pydantic.ValidationError as error:
+        raise StudyError(one_line(name_or_path, error, Space)) from None
+    _check(name_or_path, space)
+    return space
+
+
+def _check(source: str, space: Space) -> None:
+    """Everything that is searched can be, within bounds, and the towns are not those that are reported."""
+    study = space.base()
+    name = study.algorithms[0]
+    declared, settings = ALGORITHMS[name], getattr(study, name)
+    for key, wanted_values in space.space.items():
+        where = f"{source}: space.{key}"
+        if key.startswith(REWARD):
+            known = key.removeprefix(REWARD) in TERMS
+        else:
+            known = key in declared.traced or key in declared.static
+        if not known:
+            names = (*declared.traced, *declared.static, *(REWARD + term for term in TERMS))
+            raise StudyError(f"{where} is not a setting of {name}; {nearest(key, names)}")
+        if isinstance(wanted_values, Range):
+            _check_range(where, key, wanted_values, declared.static)
+        for value in values_at_the_edge(wanted_values):
+            if not key.startswith(REWARD):
+                _check_value(where, type(settings), key, value)
+    towns = space.validation
+    taken = set(seeds_of(study)) & set(range(towns.first_seed, towns.first_seed + towns.seeds))
+    if taken:
+        raise StudyError(
+            f"{source}: validation.first_seed is {towns.first_seed}: town {min(taken)} is one that the study reports; "
+            "give a number beyond its seeds"
+        )
+    for cell in towns.cells or ():
+        if not all(0 <= count <= study.params.n_devices for count in cell):
+            raise StudyError(
+                f"{source}: validation.cells has {list(cell)}; give counts from 0 to {study.params.n_devices}"
+            )
+
+
+def _check_range(where: str, key: str, values: Range, static: tuple[str, ...]) -> None:
+    if key in static:
+        raise StudyError(f"{where} has low and high, but shapes the program; give choices = [...]")
+    if not (math.isfinite(values.low) and math.isfinite(values.high) and values.low < values.high):
+        raise StudyError(f"{where} has low {values.low} and high {values.high}; give low < high")
+    if values.log and values.low <= 0:
+        raise StudyError(f"{where} has low {values.low} and log = true; give low > 0")
+
+
+def _check_value(where: str, settings: Any, key: str, value: Any) -> None:
+    whole = isinstance(settings.model_fields[key].default, int) and isinstance(value, float) and value.is_integer()
+    try:
+        settings(**{key: int(value) if whole else tuple(value) if isinstance(value, list) else value})
+    except pydantic.ValidationError as error:
+        raise StudyError(f"{where} has {value!r}; {wanted(error.errors()[0])}") from None
+
+
+def values_at_the_edge(values: Range | Choices) -> list[Any]:
+    """All choices, or both ends of a range."""
+    return values.choices if isinstance(values, Choices) else [values.low, values.high]
+
+
+def holds(values: Range | Choices, value: Any) -> bool:
+    """Whether a value is one of those that are searched."""
+    return value in values.choices if isinstance(values, Choices) else values.low <= value <= values.high
+
+
+def outer(space: Space) -> list[str]:
+    """What shapes the program: the same for all trials of a batch."""
+    declared = ALGORITHMS[space.base().algorithms[0]]
+    return [key for key in space.space if key in declared.static]
+
+
+def outer_combinations(space: Space) -> list[dict[str, Any]]:
+    """Every combination of what shapes the program; the study's own first, if it is one of them."""
+    names = outer(space)
+    own = {key: value for key, value in own_settings(space).items() if key in names}
+    choices = [values.choices for key in names if isinstance(values := space.space[key], Choices)]
+    found = [dict(zip(names, combination, strict=True)) for combination in itertools.product(*choices)]
+    return sorted(found, key=lambda combination: combination != own) if names else []
+
+
+def own_settings(space: Space) -> dict[str, Any]:
+    """The study's own values of what is searched."""
+    study = space.base()
+    settings = getattr(study, study.algorithms[0])
+    reward = reward_terms(study)
+    return {
+        key: reward.get(key.removeprefix(REWARD), 0.0) if key.startswith(REWARD) else plain(getattr(settings, key))
+        for key in space.space
+    }
+
+
+def reward_terms(study: Study) -> dict[str, float]:
+    """The weights of a study's reward by term."""
+    if isinstance(study.reward, dict):
+        return dict(study.reward)
+    return {term: float(w) for term, w in zip(TERMS, REWARDS[study.reward], strict=True) if w}
+
+
+def plain(value: Any) -> Any:
+    """A setting as TOML and JSON know it."""
+    return list(value) if isinstance(value, tuple) else value
+
+
+def reward_with(study: Study, values: Mapping[str, Any]) -> dict[str, float]:
+    """The weights of a study's reward with those among a trial's values."""
+    searched = {key.removeprefix(REWARD): float(value) for key, value in values.items() if key.startswith(REWARD)}
+    return reward_terms(study) | searched
+
+
+def settings_of(space: Space, values: Mapping[str, Any]) -> dict[str, Any]:
+    """A trial's values as changes of the study, by dotted names."""
+    study = space.base()
+    name = study.algorithms[0]
+    changes = {f"{name}.{key}": value for key, value in values.items() if not key.startswith(REWARD)}
+    reward = {"reward": reward_with(study, values)} if any(key.startswith(REWARD) for key in values) else {}
+    return dict(space.change) | changes | reward
+
+
+def digest(space: Space) -> str:
+    """What tells spaces apart; more trials are still the same search."""
+    return json.dumps(space.model_dump(mode="json", exclude={"trials", "confirm_seeds"}), sort_keys=True)
