@@ -28,7 +28,7 @@ def main() -> None:
 
     from uavmec_jax.training import host
 
-    host.use_every_core()
+    host.use_all_cores()
     from uavmec_jax.files.writing import write_text
     from uavmec_jax.reporting import canvas, figures
     from uavmec_jax.runs.run import run_or_resume

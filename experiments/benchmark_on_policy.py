@@ -64,7 +64,7 @@ def main() -> None:
         return
     from uavmec_jax.training import host
 
-    host.use_every_core()
+    host.use_all_cores()
     from importlib.util import find_spec
 
     from rich.console import Console

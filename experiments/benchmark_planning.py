@@ -14,7 +14,7 @@ from typing import Any
 
 from uavmec_jax.training import host
 
-host.use_every_core()
+host.use_all_cores()
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
@@ -22,7 +22,7 @@ import numpy as np  # noqa: E402
 
 from uavmec_jax.env.params import Params
 from uavmec_jax.planning.beam import horizon
-from uavmec_jax.planning.parallel import bound_all, play_beam, play_rollout
+from uavmec_jax.planning.parallel import beam_episodes, bound_scenarios, rollout_planner_episodes
 from uavmec_jax.planning.rollout_planner import SAMPLES
 from uavmec_jax.scenarios.seeds import held_out_draws, town
 
@@ -67,9 +67,9 @@ def benchmark(powered: int, connected: int, count: int, widths: list[int]) -> li
         return lives
 
     for width in widths:
-        reached = np.maximum(reached, measure(f"beam {width}", play_beam, *scenarios, slots=slots, width=width))
-    measure("rollout", play_rollout, *scenarios, slots=slots, samples=SAMPLES)
-    measure("bound", bound_all, *scenarios, reached, slots=slots)
+        reached = np.maximum(reached, measure(f"beam {width}", beam_episodes, *scenarios, slots=slots, width=width))
+    measure("rollout", rollout_planner_episodes, *scenarios, slots=slots, samples=SAMPLES)
+    measure("bound", bound_scenarios, *scenarios, reached, slots=slots)
     return rows
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from uavmec_jax.training import host
 
-host.use_every_core()
+host.use_all_cores()
 
 import numpy as np  # noqa: E402
 import pandas as pd  # noqa: E402
@@ -32,14 +32,14 @@ def run(out: Path, name: str, seeds: list[int], steps: int, learning_rates: list
 
 def draw(axis: object, results: Results, agent: int, label: str) -> None:
     curves = results.curves["dqn"]
-    per_look = np.diff(np.searchsorted(curves["chunk_steps"], curves["look_steps"], side="right"), prepend=0)
+    per_look = np.diff(np.searchsorted(curves["chunk_steps"], curves["validation_steps"], side="right"), prepend=0)
     ends = np.cumsum(per_look)
     training = [
         np.nanmean(curves["episode_length"][agent, end - n : end]) for end, n in zip(ends, per_look, strict=True)
     ]
-    (line,) = axis.plot(curves["look_steps"], training, lw=0.8, alpha=0.5)
+    (line,) = axis.plot(curves["validation_steps"], training, lw=0.8, alpha=0.5)
     smooth = pd.Series(curves["validation"][agent]).rolling(5, center=True, min_periods=1).mean()
-    axis.plot(curves["look_steps"], smooth, lw=1.8, color=line.get_color(), label=label)
+    axis.plot(curves["validation_steps"], smooth, lw=1.8, color=line.get_color(), label=label)
 
 
 def main() -> None:

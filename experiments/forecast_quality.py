@@ -13,7 +13,7 @@ from jaxtyping import Array, Key
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Policy
-from uavmec_jax.planning.parallel import play_policy
+from uavmec_jax.planning.parallel import policy_episodes
 
 _STREAM = 7
 """Seed of the forecasts' own futures."""
@@ -30,7 +30,7 @@ def forecast_first_failure(policy: Policy, params: Params, layouts: Layout, samp
     """
     count = layouts.capacity.shape[0]
     keys = _futures(count, samples)
-    return with_nobody(np.asarray(play_policy(policy, params, layouts, keys).first_failure).mean(axis=1))
+    return with_no_failure(np.asarray(policy_episodes(policy, params, layouts, keys).first_failure).mean(axis=1))
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -39,7 +39,7 @@ def _futures(count: int, samples: int) -> Key[Array, "B S"]:
     return jax.vmap(fold)(jnp.arange(count))
 
 
-def with_nobody(share: np.ndarray) -> np.ndarray:
+def with_no_failure(share: np.ndarray) -> np.ndarray:
     """``[..., n + 1]``: the share of the episodes in which no device fails behind those of the devices."""
     return np.concatenate([share, np.maximum(1.0 - share.sum(axis=-1, keepdims=True), 0.0)], axis=-1)
 
@@ -60,7 +60,7 @@ class ForecastQuality:
     reliability: pd.DataFrame
 
 
-def judge_forecasts(forecast: np.ndarray, happened: np.ndarray, bins: int = 10) -> ForecastQuality:
+def evaluate_forecasts(forecast: np.ndarray, happened: np.ndarray, bins: int = 10) -> ForecastQuality:
     """Hold forecasts against what happened.
 
     Args:

@@ -16,7 +16,7 @@ from typing import Any
 
 from uavmec_jax.training import host
 
-host.use_every_core()
+host.use_all_cores()
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
@@ -27,7 +27,7 @@ from generalist_figures import trade_off_figure
 from uavmec_jax.env.layout import Layout, Traffic, sample_layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.planning.heuristics import HEURISTICS
-from uavmec_jax.planning.parallel import play_policy
+from uavmec_jax.planning.parallel import policy_episodes
 from uavmec_jax.scenarios.places import on_place
 from uavmec_jax.scenarios.policies import load_policy
 from uavmec_jax.studies.statistics import mean_interval
@@ -117,7 +117,7 @@ def lives(policy: Any, params: Params, layouts: Layout, draws: int) -> Any:
     count = layouts.capacity.shape[0]
     keys = jax.random.split(jax.random.key(_VOLUMES), (count, draws))
     every = jax.tree.map(lambda leaf: jnp.broadcast_to(jnp.asarray(leaf), (count, *jnp.shape(leaf))), params)
-    return jax.tree.map(np.asarray, play_policy(policy, every, layouts, keys))
+    return jax.tree.map(np.asarray, policy_episodes(policy, every, layouts, keys))
 
 
 def row(name: str, params: Params, place: str | None, policy: Any, count: int, draws: int) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from uavmec_jax.reporting.canvas import new_figure, save
-from uavmec_jax.reporting.tables import spoken
+from uavmec_jax.reporting.tables import display_name
 
 PAPER_TRAINING_S = 660.0
 """The paper, section 5: a DQN's training takes about 11 minutes per scenario on its GPU."""
@@ -37,7 +37,7 @@ def ratio_figure(table: pd.DataFrame, path: Path) -> None:
         axis.set_xticks(range(grid.shape[1]), grid.columns)
         axis.set_yticks(range(grid.shape[0]), grid.index)
         axis.set_xlabel("devices with communication")
-        axis.set_title(f"{spoken(name)}: {grid.to_numpy().mean():.1f} %")
+        axis.set_title(f"{display_name(name)}: {grid.to_numpy().mean():.1f} %")
     axes[0].set_ylabel("devices with power")
     figure.colorbar(image, ax=list(axes), label="lifetime, % of the upper bound")
     save(figure, path)
@@ -84,7 +84,7 @@ def training_figure(curve: Mapping[str, Any], path: Path) -> None:
     for number, (name, slots) in enumerate(curve["lines"].items()):
         axis.axhline(slots, color="0.6", linewidth=0.8)
         side = "top" if number % 2 else "bottom"  # neighbours may be near
-        axis.annotate(spoken(name), (0.01, slots), xycoords=("axes fraction", "data"), fontsize=8, va=side)
+        axis.annotate(display_name(name), (0.01, slots), xycoords=("axes fraction", "data"), fontsize=8, va=side)
     axis.axvline(PAPER_TRAINING_S, color="tab:red", linewidth=1, linestyle=":")
     axis.annotate(
         "the paper's 11 minutes",

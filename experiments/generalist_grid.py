@@ -16,16 +16,16 @@ from typing import Any
 
 from uavmec_jax.training import host
 
-host.use_every_core()
+host.use_all_cores()
 
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
 import pandas as pd  # noqa: E402
-from forecast_quality import forecast_first_failure, judge_forecasts, with_nobody
+from forecast_quality import evaluate_forecasts, forecast_first_failure, with_no_failure
 from generalist_figures import ratio_figure, reliability_figure
 
 from uavmec_jax.env.rollout import Policy
-from uavmec_jax.planning.parallel import play_policy
+from uavmec_jax.planning.parallel import policy_episodes
 from uavmec_jax.runs.results_folder import load_results
 from uavmec_jax.scenarios.policies import load_policy
 from uavmec_jax.studies.population import evaluation_keys, make_agents
@@ -88,7 +88,7 @@ def play(planned: Results, policy: Policy, count: int) -> tuple[pd.DataFrame, di
     for first in range(0, len(keys), _PER_CALL):
         here = slice(first, first + _PER_CALL)
         scenario = jax.tree.map(lambda leaf, here=here: leaf[here], agents.scenario)
-        episode = play_policy(policy, scenario.params, scenario.layout, keys[here])
+        episode = policy_episodes(policy, scenario.params, scenario.layout, keys[here])
         pieces.append({name: np.asarray(leaf) for name, leaf in vars(episode).items()})
     played = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
     table = planned.agents.loc[: count - 1, ["seed", "powered", "connected"]].copy()
@@ -120,9 +120,9 @@ def forecasts(planned: Results, policy: Policy, played: dict[str, np.ndarray], s
     for first in range(0, len(played["length"]), _PER_CALL):
         own = jax.tree.map(lambda leaf, first=first: leaf[first : first + _PER_CALL], scenario)
         found.append(forecast_first_failure(policy, own.params, own.layout, samples))
-    happened = with_nobody(played["first_failure"])
+    happened = with_no_failure(played["first_failure"])
     forecast = np.repeat(np.concatenate(found)[:, None], happened.shape[1], axis=1)
-    return judge_forecasts(forecast.reshape(-1, forecast.shape[-1]), happened.reshape(-1, happened.shape[-1]))
+    return evaluate_forecasts(forecast.reshape(-1, forecast.shape[-1]), happened.reshape(-1, happened.shape[-1]))
 
 
 def interval(values: np.ndarray) -> dict[str, float]:

@@ -16,14 +16,14 @@ from typing import Any
 
 from uavmec_jax.training import host
 
-host.use_every_core()
+host.use_all_cores()
 
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
 
 from uavmec_jax.planning.beam import horizon
 from uavmec_jax.planning.heuristics import HEURISTICS
-from uavmec_jax.planning.parallel import play_beam, play_policy, play_rollout
+from uavmec_jax.planning.parallel import beam_episodes, policy_episodes, rollout_planner_episodes
 from uavmec_jax.planning.rollout_planner import SAMPLES
 from uavmec_jax.scenarios.policies import TrainedPolicy, load_policy
 from uavmec_jax.studies.population import evaluation_keys, make_agents
@@ -57,18 +57,18 @@ def main() -> None:
         seconds[name] = round(time.perf_counter() - tick, 2)
 
     for name, one in (("earliest-deadline", rule), ("generalist", policy)):
-        measure(name, lambda one=one: play_policy(one, *towns, keys[:, None]))
+        measure(name, lambda one=one: policy_episodes(one, *towns, keys[:, None]))
     for name, base in (("earliest-deadline", rule), ("generalist", policy)):
         measure(
             f"rollout, base {name}",
-            lambda base=base: play_rollout(*towns, keys, slots=slots, samples=SAMPLES, base=base)[1],
+            lambda base=base: rollout_planner_episodes(*towns, keys, slots=slots, samples=SAMPLES, base=base)[1],
         )
     for width in arguments.widths:
-        for name, appraise in (("own score", None), ("generalist's critic", policy.appraise)):
+        for name, value_fn in (("own score", None), ("generalist's critic", policy.value_fn)):
             measure(
                 f"beam {width}, {name}",
-                lambda width=width, appraise=appraise: play_beam(
-                    *towns, keys, slots=slots, width=width, appraise=appraise
+                lambda width=width, value_fn=value_fn: beam_episodes(
+                    *towns, keys, slots=slots, width=width, value_fn=value_fn
                 )[1],
             )
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from uavmec_jax.training import host
 
-host.use_every_core()
+host.use_all_cores()
 
 import jax  # noqa: E402
 import numpy as np  # noqa: E402

@@ -19,7 +19,7 @@ from typing import Any
 
 from uavmec_jax.training import host
 
-host.use_every_core()
+host.use_all_cores()
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
@@ -28,15 +28,15 @@ from generalist_figures import training_figure
 
 from uavmec_jax.agents import on_policy
 from uavmec_jax.agents.gae import log_probability
-from uavmec_jax.agents.optimizers import Descent, clipped_adam, descend
+from uavmec_jax.agents.optimizers import TrainState, apply_gradients, clipped_adam
 from uavmec_jax.agents.registry import ALGORITHMS
 from uavmec_jax.env.dynamics import initial_state
-from uavmec_jax.env.generator import ScenarioDistribution, scenario_of_draw
+from uavmec_jax.env.generator import ScenarioDistribution, scenario_from_draw
 from uavmec_jax.env.rollout import rollouts, tour_policy, trace, volume_table
 from uavmec_jax.planning.beam import WIDTH, beam_search, horizon, longest
 from uavmec_jax.planning.parallel import spread
 from uavmec_jax.runs.results_folder import load_results
-from uavmec_jax.runs.run_plan import plan_study
+from uavmec_jax.runs.run_plan import plan_run
 from uavmec_jax.studies.population import evaluation_keys, make_agents, make_algorithm, seeds_of, validation_keys
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.studies.study import load_study
@@ -119,7 +119,7 @@ def compiled(study: Study) -> Trainer:
     """The programs that train the agents of the study, whatever their learning rate."""
     algorithm, agents, keys = make_algorithm(study), make_agents(study), validation_keys(study)
     assert algorithm is not None
-    settings, blocks = study.evaluation, plan_study(study).blocks["ppo"]
+    settings, blocks = study.evaluation, plan_run(study).blocks["ppo"]
     validation = Validation(every=settings.validate_every, draws=settings.validation_draws, chunks=1)
     return Trainer.compile(algorithm, agents, keys, validation, blocks)
 
@@ -165,11 +165,11 @@ def grid(study: Study, towns: int) -> tuple[Callable[[Any], np.ndarray], dict[st
 def collect(study: Study, distribution: ScenarioDistribution, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Observations ``[N, words]``, the beam's visits ``[N]`` and the slots it still lives ``[N]``."""
     keys = jax.random.split(jax.random.key(_TEACHER), 2 * count)
-    scenarios = jax.jit(jax.vmap(partial(scenario_of_draw, distribution)))(keys)
+    scenarios = jax.jit(jax.vmap(partial(scenario_from_draw, distribution)))(keys)
     # A few drawn scenarios can last for hundreds of slots, and the beam for hours on them.
     short = np.flatnonzero(np.asarray(longest(scenarios.params, scenarios.layout)) <= _LONGEST)[:count]
     scenarios, keys = jax.tree.map(lambda leaf: leaf[short], (scenarios, keys))
-    slots, see = horizon(scenarios.params, scenarios.layout), spec_of(study).perception.see
+    slots, see = horizon(scenarios.params, scenarios.layout), spec_of(study).observation_spec.see
 
     def one(params: Any, layout: Any, key: Any) -> tuple[Any, ...]:
         volumes = volume_table(params, layout.capacity.shape[0], key, slots)
@@ -203,15 +203,15 @@ def imitate(study: Study, lessons: tuple[np.ndarray, ...], seed: int, epochs: in
         likely, _ = log_probability(scores, visits[chosen])
         return -jnp.mean(likely) + 0.5 * jnp.mean(jnp.square(values - worth[chosen]))
 
-    def step(number: Any, descent: Descent) -> Descent:
+    def step(number: Any, train_state: TrainState) -> TrainState:
         chosen = jax.random.randint(jax.random.fold_in(jax.random.key(seed), number), (_BATCH,), 0, len(visits))
-        loss, gradient = jax.value_and_grad(loss_of)(descent.weights, chosen)
+        loss, gradient = jax.value_and_grad(loss_of)(train_state.weights, chosen)
         rate = study.ppo.learning_rate * 0.1 ** (number / updates)
         settings: dict[str, Any] = {"learning_rate": rate, "max_norm": 0.5, "count": number + 1, "steps_done": number}
-        return descend(_OPTIMIZER, descent, loss, gradient, **settings)
+        return apply_gradients(_OPTIMIZER, train_state, loss, gradient, **settings)
 
-    begun = Descent(weights, _OPTIMIZER.init(weights), jnp.int32(-1))
-    return jax.jit(lambda descent: jax.lax.fori_loop(0, updates, step, descent))(begun).weights
+    begun = TrainState(weights, _OPTIMIZER.init(weights), jnp.int32(-1))
+    return jax.jit(lambda train_state: jax.lax.fori_loop(0, updates, step, train_state))(begun).weights
 
 
 def teach(run: Run, weights: list[Any]) -> Run:
@@ -231,9 +231,9 @@ def paper_dqn() -> dict[str, Any]:
     curves = load_results(Path("results/table5")).curves["dqn"]
     rows = json.loads(Path("results/benchmark/benchmark_dqn.json").read_text(encoding="utf-8"))["training"]
     speed = next(row["steps_per_second"] for row in rows if row["agents"] == 1)
-    chosen = np.unique(np.geomspace(1, len(curves["look_steps"]), 12).astype(int)) - 1
+    chosen = np.unique(np.geomspace(1, len(curves["validation_steps"]), 12).astype(int)) - 1
     return {
-        "seconds": np.round(curves["look_steps"][chosen] / speed, 2).tolist(),
+        "seconds": np.round(curves["validation_steps"][chosen] / speed, 2).tolist(),
         "slots": np.round(curves["validation"][:, chosen].mean(axis=0), 3).tolist(),
         "towns": len(curves["validation"]),
     }

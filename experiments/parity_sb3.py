@@ -132,7 +132,7 @@ def play(model: Any) -> Any:
 
 
 def rollout_of(buffer: Any) -> dict[str, np.ndarray]:
-    """The rollout of one environment, as it was recorded."""
+    """The rollout of one environment, as it was rollout_with_actions."""
     names = ("observations", "actions", "rewards", "values", "log_probs", "advantages", "returns", "episode_starts")
     return {name: getattr(buffer, name)[:, 0].copy() for name in names}
 

@@ -80,15 +80,15 @@ def ours(seeds: int, steps: int) -> list[float]:
     from uavmec_jax.env.rollout import rollouts
     from uavmec_jax.env.scenario import make_scenario
     from uavmec_jax.training import host, population
-    from uavmec_jax.training.partition import plan_blocks
+    from uavmec_jax.training.partition import partition_population
     from uavmec_jax.training.training import Validation
 
-    host.use_every_core()
+    host.use_all_cores()
     algorithm = dqn.algorithm(dqn.DQNSpec(total_steps=steps))
     alone = Agent(key=jax.random.key(0), scenario=make_scenario(layout()), hyper=dqn.DQNHyper())
     agents = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (seeds, *jnp.shape(leaf))), alone)
     agents = agents.replace(key=jax.random.split(jax.random.key(1), seeds))
-    blocks = plan_blocks(seeds, algorithm.agent_bytes, host.free_memory())
+    blocks = partition_population(seeds, algorithm.agent_bytes, host.free_memory())
     keys = jax.random.split(jax.random.key(2), (seeds, 1))
     lifetimes: list[float] = []
     for block in population.train(algorithm, agents, keys, validation=Validation(every=steps, draws=1), blocks=blocks):

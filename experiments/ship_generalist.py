@@ -12,7 +12,7 @@ from pathlib import Path
 
 from uavmec_jax.training import host
 
-host.use_every_core()
+host.use_all_cores()
 
 from uavmec_jax.runs.run import run_or_resume
 from uavmec_jax.scenarios.policies import TrainedPolicy, load_policy

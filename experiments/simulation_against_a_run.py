@@ -48,16 +48,16 @@ def main() -> None:
 
     from uavmec_jax.training import host
 
-    host.use_every_core()
+    host.use_all_cores()
     from uavmec_jax.files.writing import write_text
     from uavmec_jax.runs.results_folder import load_results
-    from uavmec_jax.runs.run_plan import plan_study
+    from uavmec_jax.runs.run_plan import plan_run
     from uavmec_jax.runs.simulate import simulate
     from uavmec_jax.studies.study import load_study
 
     run = load_results(arguments.out).run
     study = load_study(arguments.study, dict(assignment(one) for one in arguments.settings))
-    plan = plan_study(study)
+    plan = plan_run(study)
     devices = max(cut.groups for cut in plan.blocks.values())
     speed = run.get("training_steps_per_second", 1) / devices
     said = simulate(study, plan, speed=speed, devices=devices).as_json()

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from uavmec_jax.training import host
 
-host.use_every_core()
+host.use_all_cores()
 
 from rich.console import Console  # noqa: E402
 

@@ -5,7 +5,7 @@ import sys
 import tempfile
 
 # The same program is compiled once in a session, whichever worker, test or subprocess asks for it: the first process
-# makes the folder, the others inherit its name. Who runs several sessions may give one folder to all of them.
+# makes the folder, the others inherit its name. AgentIds runs several sessions may give one folder to all of them.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     _cache = tempfile.TemporaryDirectory(prefix="uavmec-jax-tests-")
     os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache.name

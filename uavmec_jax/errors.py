@@ -9,8 +9,8 @@ class StudyError(UserError):
     """A study, a run folder or an option is not usable."""
 
 
-class LayoutError(UserError):
-    """An inventory of devices is not usable."""
+class ScenarioError(UserError):
+    """An named_scenario of devices is not usable."""
 
 
 class PolicyError(UserError):

@@ -258,10 +258,10 @@ def test_dueling_values_have_advantages_of_mean_zero():
 def test_soft_update_of_the_target():
     weights, target = (dqn.init(SPEC, make_agent(seed)).weights for seed in (0, 1))
     leaf = lambda tree: np.asarray(tree["params"]["TorchDense_1"]["kernel"])  # noqa: E731
-    mixed = dqn.mix_if(jnp.asarray(True), 0.25, weights, target)
+    mixed = dqn.update_target(jnp.asarray(True), 0.25, weights, target)
     assert_allclose(leaf(mixed), 0.25 * leaf(weights) + 0.75 * leaf(target), rtol=1e-6)
-    jax.tree.map(assert_array_equal, dqn.mix_if(jnp.asarray(True), 1.0, weights, target), weights)
-    jax.tree.map(assert_array_equal, dqn.mix_if(jnp.asarray(False), 0.25, weights, target), target)
+    jax.tree.map(assert_array_equal, dqn.update_target(jnp.asarray(True), 1.0, weights, target), weights)
+    jax.tree.map(assert_array_equal, dqn.update_target(jnp.asarray(False), 0.25, weights, target), target)
 
 
 @pytest.mark.slow

@@ -8,8 +8,8 @@ from numpy.testing import assert_array_equal
 
 from tests.small_scenarios import mid_life
 from uavmec_jax.agents import ppo
-from uavmec_jax.agents.networks import NOT_THERE, sum_over_devices
-from uavmec_jax.agents.observation_spec import PERCEPTIONS
+from uavmec_jax.agents.networks import ABSENT_LOGIT, sum_over_devices
+from uavmec_jax.agents.observation_spec import OBSERVATIONS
 from uavmec_jax.env.layout import pad_layout
 from uavmec_jax.planning.observation import FEATURES, observe_devices
 
@@ -20,7 +20,7 @@ WEIGHTS = SPEC.network.init(jax.random.key(3), jnp.zeros((1, SPEC.words)))
 @jax.jit
 def judge(params, layout, state):
     """Logits and value of one state."""
-    seen = PERCEPTIONS["full"].see(params, layout, state)
+    seen = OBSERVATIONS["full"].see(params, layout, state)
     logits, value = SPEC.network.apply(WEIGHTS, seen[None])
     return logits[0], value[0]
 
@@ -53,7 +53,7 @@ def test_padding_changes_nothing(n):
     wide, same = judge(params, padded, more)
     np.testing.assert_allclose(wide[:n], logits, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(same, value, rtol=1e-5, atol=1e-6)
-    assert_array_equal(wide[n:], np.full(4, NOT_THERE, np.float32))
+    assert_array_equal(wide[n:], np.full(4, ABSENT_LOGIT, np.float32))
 
 
 @pytest.mark.slow

@@ -43,11 +43,11 @@ def population(name, *hypers):
 
 def test_actions_are_drawn_from_the_softmax():
     scores = jnp.tile(jnp.log(jnp.array([[0.5, 0.2, 0.0, 0.3]])), (20_000, 1))
-    actions = np.asarray(estimates.choose(scores, jax.random.uniform(jax.random.key(0), (20_000,))))
+    actions = np.asarray(estimates.sample_action(scores, jax.random.uniform(jax.random.key(0), (20_000,))))
     counts = np.bincount(actions, minlength=4)
     assert counts[2] == 0
     assert stats.chisquare(counts[[0, 1, 3]], [10_000, 4_000, 6_000]).pvalue > 1e-3
-    edges = estimates.choose(scores[:2], jnp.array([0.0, 1.0 - 2.0**-24]))
+    edges = estimates.sample_action(scores[:2], jnp.array([0.0, 1.0 - 2.0**-24]))
     assert_array_equal(edges, [0, 3])
 
 

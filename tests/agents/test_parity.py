@@ -16,7 +16,7 @@ from uavmec_jax.agents import a2c, dqn, on_policy, ppo
 from uavmec_jax.agents import gae as estimates
 from uavmec_jax.agents.algorithm import AGENTS_AXIS
 from uavmec_jax.agents.collect_rollout import Samples
-from uavmec_jax.agents.optimizers import Descent, clipped_adam, clipped_rmsprop, global_norm
+from uavmec_jax.agents.optimizers import TrainState, clipped_adam, clipped_rmsprop, global_norm
 from uavmec_jax.agents.replay import Transition
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "sb3"
@@ -69,7 +69,7 @@ def test_dqn_updates():
     theirs, spec, hyper = golden("dqn"), dqn.DQNSpec(), dqn.DQNHyper()
     weights, target = tree(theirs, "weights_0", DQN_LAYERS), tree(theirs, "target", DQN_LAYERS)
     state = dqn.init(spec, make_agent()).replace(weights=weights, target=target)
-    state = state.replace(moments=clipped_adam().init(weights), rows=None)
+    state = state.replace(opt_state=clipped_adam().init(weights), rows=None)
     loss_of = jax.jit(jax.value_and_grad(lambda w, batch: dqn.td_loss(spec, hyper, w, target, batch)))
     learn = jax.jit(lambda state, batch, step: dqn._learn(spec, hyper, state, batch, step))
     losses = []
@@ -99,7 +99,7 @@ def samples(arrays, *place):
     return Samples(
         observation=at("observations"),
         action=at("actions")[..., 0].astype(jnp.int32),
-        advantage=at("advantages"),
+        advantage=at("generalized_advantages"),
         returns=at("returns"),
         log_prob=at("log_probs"),
     )
@@ -116,11 +116,11 @@ def test_ppo_epoch():
     assert_allclose(loss, theirs["losses"][0], rtol=CLOSE)
     assert_near(clipped(gradient, hyper.max_grad_norm), tree(theirs, "gradient", ACTOR_CRITIC_LAYERS))
 
-    descent = Descent(weights, clipped_adam(eps=1e-5).init(weights), jnp.int32(-1))
+    train_state = TrainState(weights, clipped_adam(eps=1e-5).init(weights), jnp.int32(-1))
     for minibatches in (1, 10, 32):
         spec = ppo.PPOSpec(n_steps=64 * minibatches)
         learn = jax.jit(functools.partial(ppo.learn, spec, hyper))
-        after, loss = learn(descent, rows[: 64 * minibatches], 1, 2048)
+        after, loss = learn(train_state, rows[: 64 * minibatches], 1, 2048)
         assert_allclose(loss, theirs["losses"][minibatches - 1], rtol=CLOSE)
         assert_near(after.weights, tree(theirs, f"weights_{minibatches}", ACTOR_CRITIC_LAYERS))
 
@@ -128,19 +128,19 @@ def test_ppo_epoch():
 def test_a2c_updates():
     theirs, spec, hyper = golden("a2c"), a2c.A2CSpec(), a2c.A2CHyper()
     weights = tree(theirs, "weights_0", ACTOR_CRITIC_LAYERS)
-    descent = Descent(weights, clipped_rmsprop().init(weights), jnp.int32(-1))
+    train_state = TrainState(weights, clipped_rmsprop().init(weights), jnp.int32(-1))
     loss_of = jax.jit(jax.value_and_grad(lambda w: a2c.a2c_loss(spec, hyper, w, samples(theirs, 0))))
     _, gradient = loss_of(weights)
     assert_near(clipped(gradient, hyper.max_grad_norm), tree(theirs, "gradient", ACTOR_CRITIC_LAYERS))
     learn = jax.jit(functools.partial(a2c.learn, spec, hyper))
     losses = []
     for k in range(10):
-        descent, loss = learn(descent, samples(theirs, k), 5 * (k + 1))
+        train_state, loss = learn(train_state, samples(theirs, k), 5 * (k + 1))
         losses.append(float(loss))
         if k == 0:
-            assert_near(descent.weights, tree(theirs, "weights_1", ACTOR_CRITIC_LAYERS))
+            assert_near(train_state.weights, tree(theirs, "weights_1", ACTOR_CRITIC_LAYERS))
     assert_allclose(losses, theirs["losses"], rtol=CLOSE)
-    assert_near(descent.weights, tree(theirs, "weights_10", ACTOR_CRITIC_LAYERS))
+    assert_near(train_state.weights, tree(theirs, "weights_10", ACTOR_CRITIC_LAYERS))
 
 
 @pytest.mark.parametrize(("name", "gae_lambda", "place"), [("ppo", 0.95, ()), ("a2c", 1.0, (3,))])
@@ -155,11 +155,13 @@ def test_values_log_probabilities_and_advantages(name, gae_lambda, place):
         assert_allclose(estimates.log_probability(scores, rollout.action)[0], at("log_probs"), rtol=1e-5)
     # SB3 notes where an episode starts; it ended the slot before. The value after the last slot follows from its advantage.
     ended = np.append(at("episode_starts")[1:], 0).astype(bool)
-    last_value = (at("advantages")[-1] - at("rewards")[-1] + at("values")[-1]) / 0.98
+    last_value = (at("generalized_advantages")[-1] - at("rewards")[-1] + at("values")[-1]) / 0.98
     columns = (jnp.asarray(at(key))[:, None] for key in ("rewards", "values"))
-    found = estimates.advantages(*columns, jnp.array([last_value]), jnp.asarray(ended)[:, None], 0.98, gae_lambda)
-    assert_allclose(found[:, 0], at("advantages"), rtol=1e-4, atol=1e-4)
-    assert_allclose(rollout.returns, at("advantages") + at("values"), rtol=1e-6)
+    found = estimates.generalized_advantages(
+        *columns, jnp.array([last_value]), jnp.asarray(ended)[:, None], 0.98, gae_lambda
+    )
+    assert_allclose(found[:, 0], at("generalized_advantages"), rtol=1e-4, atol=1e-4)
+    assert_allclose(rollout.returns, at("generalized_advantages") + at("values"), rtol=1e-6)
 
 
 def test_epsilon():

@@ -12,7 +12,7 @@ from numpy.testing import assert_array_equal
 import uavmec_jax as um
 from tests.scenarios.test_scenario_files import EXAMPLES
 from uavmec_jax.cli import main
-from uavmec_jax.env.rollout import play_on
+from uavmec_jax.env.rollout import rollout_from
 from uavmec_jax.scenarios.policies import load_policy
 
 HARBOUR = EXAMPLES / "harbour.toml"
@@ -35,7 +35,7 @@ def told():
 
 
 def test_json_says_what_was_asked(told):
-    names = um.load_inventory(HARBOUR).names
+    names = um.load_scenario_file(HARBOUR).names
     assert told["next"]["name"] in names
     assert told["ranking"][0]["name"] == told["next"]["name"]
     assert sorted(one["name"] for one in told["ranking"]) == sorted(names)
@@ -51,14 +51,16 @@ def test_json_says_what_was_asked(told):
 @pytest.mark.slow
 def test_one_visit_after_the_other(tmp_path, told):
     """The state that it prints can be given back; the next one is advised on likewise."""
-    inventory = um.load_inventory(HARBOUR)
-    state = um.initial_state(inventory.params, inventory.layout)
+    named_scenario = um.load_scenario_file(HARBOUR)
+    state = um.initial_state(named_scenario.params, named_scenario.layout)
     volumes = jnp.full(6, 3e6)
-    after, outcome = um.transition(inventory.params, inventory.layout, state, told["next"]["device"] - 1, volumes)
+    after, outcome = um.transition(
+        named_scenario.params, named_scenario.layout, state, told["next"]["device"] - 1, volumes
+    )
     assert int(outcome.cause) == um.Cause.NONE
     from uavmec_jax.scenarios.state_files import state_data
 
-    (tmp_path / "now.json").write_text(json.dumps(state_data(after, inventory)))
+    (tmp_path / "now.json").write_text(json.dumps(state_data(after, named_scenario)))
     done = advise(HARBOUR, "--state", tmp_path / "now.json", "--samples", 32, "--json", "--no-what-if")
     again = json.loads(done.stdout)
     assert again["state"]["slot"] == 1
@@ -123,7 +125,7 @@ def test_the_shipped_policy_is_a_policy_like_any_other(generalist, n):
     assert int(jax.jit(generalist)(params, layout, state)) == int(alone)
     states = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), state)
     assert_array_equal(generalist(params, layout, states), [alone, alone])
-    assert generalist.appraise(params, layout, states).shape == (2,)
+    assert generalist.value_fn(params, layout, states).shape == (2,)
 
 
 @pytest.mark.slow
@@ -158,7 +160,7 @@ def test_a_first_failure_is_foretold(generalist):
     params, layout = um.Params(), um.sample_layout(jax.random.key(11), um.Params(), 4, 8)
     advice = um.advise(generalist, params, layout, samples=64)
     state, keys = um.initial_state(params, layout), jax.random.split(jax.random.key(5), 64)
-    played = jax.jit(jax.vmap(lambda key: play_on(generalist, params, layout, state, key)))(keys)
+    played = jax.jit(jax.vmap(lambda key: rollout_from(generalist, params, layout, state, key)))(keys)
     share = np.asarray(played.first_failure).mean(axis=0)
     assert np.abs(share - advice.first_failure).max() < 0.45
     assert abs(np.asarray(played.length).mean() - advice.lifetimes.mean()) < 1.5

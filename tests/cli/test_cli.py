@@ -177,7 +177,7 @@ def test_evaluate_an_agent_of_a_run(run_directory, tmp_path):
     assert mine["mean"] == agents["best_lifetime"].item()
     assert oldest["mean"] == agents["oldest_first_lifetime"].item()
     again = CliRunner().invoke(main, ["evaluate", str(tmp_path / "policy.npz"), *place]).stdout
-    assert "Trained by DQN on seed 1, powered 12, connected 8." in again
+    assert "TrainedPopulation by DQN on seed 1, powered 12, connected 8." in again
     assert "another town" not in again
     elsewhere = CliRunner().invoke(main, ["evaluate", str(tmp_path / "policy.npz"), "--draws", "4"]).stdout
     assert "another town" in elsewhere

@@ -25,7 +25,7 @@ def test_status_of_a_run_that_nobody_has_started(planned):
     assert "steps: 0 of 16,000 (0%)" in said
     assert f"nobody is at work; go on with: uavmec resume {planned}" in said
     told = json.loads(CliRunner().invoke(main, ["status", str(planned), "--json"]).stdout)
-    assert (told["steps"], told["of_steps"], told["seconds_left"]) == (0, 16_000, None)
+    assert (told["steps"], told["total_steps"], told["seconds_left"]) == (0, 16_000, None)
     assert told["disk_bytes"] > 1000
 
 

@@ -7,11 +7,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from uavmec_jax.env import hardware as tables
-from uavmec_jax.env.generator import ScenarioDistribution, sample_scenario, scenario_of_draw
+from uavmec_jax.env.generator import ScenarioDistribution, sample_scenario, scenario_from_draw
 from uavmec_jax.env.layout import pad_layout, sample_layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rewards import make_reward
-from uavmec_jax.env.rollout import play_draws, rollout, rollouts
+from uavmec_jax.env.rollout import rollout, rollout_draws, rollouts
 from uavmec_jax.env.scenario import make_scenario
 from uavmec_jax.planning.heuristics import HEURISTICS
 
@@ -97,12 +97,12 @@ def test_draws_are_played_in_their_own_scenarios():
     distribution = ScenarioDistribution(PARAMS, make_reward({}))
     keys = jax.random.split(jax.random.key(3), 4)
     rule = HEURISTICS["oldest-first"]
-    lives = jax.jit(lambda keys: play_draws(rule, distribution, keys).length)(keys)
+    lives = jax.jit(lambda keys: rollout_draws(rule, distribution, keys).length)(keys)
     for key, life in zip(keys, lives, strict=True):
-        one = scenario_of_draw(distribution, key)
+        one = scenario_from_draw(distribution, key)
         assert int(jax.jit(lambda one, key: rollout(rule, one.params, one.layout, key).length)(one, key)) == life
     fixed = make_scenario()
-    assert_array_equal(play_draws(rule, fixed, keys).length, rollouts(rule, fixed.params, fixed.layout, keys).length)
+    assert_array_equal(rollout_draws(rule, fixed, keys).length, rollouts(rule, fixed.params, fixed.layout, keys).length)
 
 
 @pytest.mark.slow

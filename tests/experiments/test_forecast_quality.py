@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from forecast_quality import forecast_first_failure, judge_forecasts, with_nobody
+from forecast_quality import evaluate_forecasts, forecast_first_failure, with_no_failure
 from numpy.testing import assert_allclose, assert_array_equal
 
 from uavmec_jax.env.layout import sample_layout
@@ -15,7 +15,7 @@ from uavmec_jax.planning.heuristics import HEURISTICS
 def test_quality_worked_out_by_hand():
     forecast = np.array([[0.7, 0.3, 0.0], [0.4, 0.6, 0.0], [0.1, 0.1, 0.8]])
     happened = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    quality = judge_forecasts(forecast, happened, bins=2)
+    quality = evaluate_forecasts(forecast, happened, bins=2)
     assert_array_equal(quality.named_right, [True, False, True])
     assert_allclose(quality.brier, [0.09 + 0.09, 0.36 + 0.36, 0.01 + 0.01 + 0.04])
     low, high = quality.reliability.itertuples()
@@ -25,12 +25,12 @@ def test_quality_worked_out_by_hand():
 
 
 def test_who_shares_the_first_failure_is_named_right():
-    quality = judge_forecasts(np.array([[0.2, 0.5, 0.3]]), np.array([[0.5, 0.5, 0.0]]))
+    quality = evaluate_forecasts(np.array([[0.2, 0.5, 0.3]]), np.array([[0.5, 0.5, 0.0]]))
     assert quality.named_right.all()
 
 
 def test_nobody_has_the_rest():
-    assert_allclose(with_nobody(np.array([[0.25, 0.25], [0.5, 0.5]])), [[0.25, 0.25, 0.5], [0.5, 0.5, 0.0]])
+    assert_allclose(with_no_failure(np.array([[0.25, 0.25], [0.5, 0.5]])), [[0.25, 0.25, 0.5], [0.5, 0.5, 0.0]])
 
 
 @pytest.mark.slow

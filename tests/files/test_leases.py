@@ -1,4 +1,4 @@
-"""Who holds a shard: one at a time, whatever the clocks say; the dead lose it, the sleeping find out."""
+"""AgentIds holds a shard: one at a time, whatever the clocks say; the dead lose it, the sleeping find out."""
 
 import json
 import threading
@@ -7,8 +7,8 @@ import time
 import pytest
 
 from uavmec_jax.errors import StudyError
-from uavmec_jax.files.leases import LeaseLostError, Leases, is_quiet, read_lease
 from uavmec_jax.files import leases as module
+from uavmec_jax.files.leases import LeaseLostError, Leases, is_stale, read_lease
 
 pytestmark = pytest.mark.slow
 
@@ -88,7 +88,7 @@ def test_whoever_wants_to_hold_it_waits_for_a_sign_of_life(tmp_path):
 
 def test_beats_keep_it(tmp_path):
     lease = Leases(QUICK).claim(tmp_path)
-    lease.news["steps"] = 5
+    lease.progress["steps"] = 5
     other = Leases(QUICK)
     deadline = time.monotonic() + 3 * QUICK
     while time.monotonic() < deadline:
@@ -125,7 +125,7 @@ def test_a_damaged_lease_is_somebodys_until_its_time_is_over(tmp_path, content):
 
 def test_what_status_makes_of_it(tmp_path):
     lease = Leases().claim(tmp_path)
-    assert not is_quiet(read_lease(tmp_path), 60)
+    assert not is_stale(read_lease(tmp_path), 60)
     lease.release()
-    assert is_quiet(read_lease(tmp_path), 60)
+    assert is_stale(read_lease(tmp_path), 60)
     assert read_lease(tmp_path / "nothing") == {}

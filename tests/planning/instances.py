@@ -36,5 +36,5 @@ def small_instance(number: int, *, devices: int | None = None, readings: bool = 
 
 
 def traced(params: Params) -> Params:
-    """The parameters as arrays, so that every instance shares one compilation."""
+    """The parameters as arrays, so that every instance visit_shares one compilation."""
     return jax.tree.map(lambda leaf: np.float32(leaf) if isinstance(leaf, float) else np.asarray(leaf), params)

@@ -72,7 +72,7 @@ def test_the_policys_own_choice_is_kept_where_nothing_is_better():
     params, layout, _ = mid_life(0, 3)
     layout = layout.replace(has_power=jnp.ones(3, bool), has_comms=jnp.ones(3, bool), position=jnp.zeros((3, 2)))
     advice = advise(RULE, params, layout, samples=8)
-    assert advice.chosen == advice.of_policy
+    assert advice.chosen == advice.policy_choice
     assert advice.first_failure.sum() == 0
 
 

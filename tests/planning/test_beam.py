@@ -71,7 +71,7 @@ def test_shares_never_charge_a_hover_point_more_than_one_visit():
         params = Params(region_m=(150.0, 150.0))
         layout = town(seed, params, 6, 6)
         covers = demand.coverage(params, layout)
-        charged = demand.shares(layout, covers)
+        charged = demand.visit_shares(layout, covers)
         assert (covers @ charged).max() <= 1 + 1e-6
         needy = ~(layout.has_power & layout.has_comms)
         assert ((charged > 0) == needy).all()

@@ -17,7 +17,7 @@ from uavmec_jax.planning.bound import _refuted, upper_bound
 from uavmec_jax.planning.exact import exact_tour
 from uavmec_jax.planning.flight import Rounds
 from uavmec_jax.planning.heuristics import HEURISTICS
-from uavmec_jax.planning.parallel import bound_all, play_beam, play_heuristics, play_rollout
+from uavmec_jax.planning.parallel import beam_episodes, bound_scenarios, heuristic_episodes, rollout_planner_episodes
 from uavmec_jax.planning.rollout_planner import rollout_planner
 from uavmec_jax.scenarios.seeds import town
 
@@ -71,10 +71,10 @@ def test_nobody_passes_the_bound_in_many_towns(side):
     layouts = jax.vmap(lambda seed, own, p, c: town(seed, own, p, c))(jnp.arange(count), params, *jnp.asarray(counts))
     keys = jax.random.split(jax.random.key(int(side)), count)
     slots = horizon(params, layouts)
-    lives = {name: play_heuristics((name,), params, layouts, keys[:, None]).length[0, :, 0] for name in HEURISTICS}
-    lives["rollout"] = play_rollout(params, layouts, keys, slots=slots, samples=2)[1].length
-    lives |= {f"beam {w}": play_beam(params, layouts, keys, slots=slots, width=w)[1].length for w in (2, 64)}
-    bound = bound_all(params, layouts, keys, np.ones(count), slots=slots)
+    lives = {name: heuristic_episodes((name,), params, layouts, keys[:, None]).length[0, :, 0] for name in HEURISTICS}
+    lives["rollout"] = rollout_planner_episodes(params, layouts, keys, slots=slots, samples=2)[1].length
+    lives |= {f"beam {w}": beam_episodes(params, layouts, keys, slots=slots, width=w)[1].length for w in (2, 64)}
+    bound = bound_scenarios(params, layouts, keys, np.ones(count), slots=slots)
     for name, reached in lives.items():
         assert (np.asarray(reached) <= bound).all(), name
 

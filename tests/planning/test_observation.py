@@ -56,8 +56,8 @@ def test_numbers_worked_out_by_hand(small):
 def test_what_is_hoped_for_is_what_the_rule_hopes_for():
     for seed in range(2):
         params, layout, state = mid_life(seed, 12)
-        charged = demand.shares(layout, demand.coverage(params, layout))
-        slots, services = deadlines.hoped_for(params, layout, state, demand.mean_slot(params, layout), charged)
+        charged = demand.visit_shares(layout, demand.coverage(params, layout))
+        slots, services = deadlines.feasible_horizon(params, layout, state, demand.mean_slot(params, layout), charged)
         seen = features(params, layout, state)
         assert_allclose(seen["hoped"], slots / 32, rtol=1e-6)
         assert_allclose(seen["services"], services / slots, rtol=1e-6)

@@ -11,7 +11,7 @@ from tests.scenarios.test_scenario_files import EXAMPLES
 from uavmec_jax.cli import main
 from uavmec_jax.planning.heuristics import HEURISTICS
 from uavmec_jax.scenarios.load import load_scenario
-from uavmec_jax.scenarios.scenario_files import load_inventory
+from uavmec_jax.scenarios.scenario_files import load_scenario_file
 from uavmec_jax.studies.population import evaluation_keys, make_agents
 from uavmec_jax.studies.study import parse_study
 
@@ -52,7 +52,7 @@ def test_json_says_everything(harbour):
 def test_slots_add_up(harbour):
     data, _ = harbour
     slots = data["slots"]["rollout"]
-    position = load_inventory(EXAMPLES / "harbour.toml").layout.position
+    position = load_scenario_file(EXAMPLES / "harbour.toml").layout.position
     energy = 1.2e6
     here = np.zeros(2)
     for slot in slots:
@@ -70,7 +70,7 @@ def test_files(harbour):
     data, directory = harbour
     assert {file.name for file in directory.iterdir()} == {"plan.json", "plan.png", "plan.geojson", "layout.toml"}
     assert json.loads((directory / "plan.json").read_text())["bound"] == data["bound"]
-    assert load_inventory(directory / "layout.toml").file == load_inventory(EXAMPLES / "harbour.toml").file
+    assert load_scenario_file(directory / "layout.toml").file == load_scenario_file(EXAMPLES / "harbour.toml").file
     features = json.loads((directory / "plan.geojson").read_text())["features"]
     assert [feature["geometry"]["type"] for feature in features] == ["Point"] * 6 + ["LineString"] * 2
     assert features[0]["geometry"]["coordinates"] == pytest.approx([9.9870, 53.5430], abs=1e-6)
@@ -79,10 +79,10 @@ def test_files(harbour):
 
 def test_a_seed_is_the_same_town_and_the_same_volumes_as_in_a_study():
     study = parse_study("[axes]\npowered = [8]\nconnected = [6]\nseeds = [3]", "x")
-    inventory, draws = load_scenario(None, powered=8, connected=6, seed=3, draws=5)
+    named_scenario, draws = load_scenario(None, powered=8, connected=6, seed=3, draws=5)
     agents = make_agents(study)
-    np.testing.assert_array_equal(inventory.layout.position, agents.scenario.layout.position[0])
-    np.testing.assert_array_equal(inventory.layout.has_comms, agents.scenario.layout.has_comms[0])
+    np.testing.assert_array_equal(named_scenario.layout.position, agents.scenario.layout.position[0])
+    np.testing.assert_array_equal(named_scenario.layout.has_comms, agents.scenario.layout.has_comms[0])
     theirs = jax.random.key_data(evaluation_keys(study)[0, :5])
     np.testing.assert_array_equal(jax.random.key_data(draws), theirs)
 

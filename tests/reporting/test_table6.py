@@ -10,7 +10,7 @@ from rich.console import Console
 from uavmec_jax.reporting import canvas, figures
 from uavmec_jax.reporting.table6 import is_table6, label_rewards
 from uavmec_jax.reporting.tables import tables
-from uavmec_jax.studies.population import identities
+from uavmec_jax.studies.population import make_agent_ids
 from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.study import load_study
 
@@ -19,7 +19,7 @@ from uavmec_jax.studies.study import load_study
 def results():
     """Every agent of the shipped study with an invented life: PPO on "A" in 8/8 lives 21 to 25 slots, all others 12."""
     study = load_study("table6")
-    agents = pd.DataFrame(identities(study))
+    agents = pd.DataFrame(make_agent_ids(study))
     chosen = (agents.algorithm == "ppo") & (agents.reward == "A") & (agents.powered == 8)
     lifetime = np.where(chosen, 21.0 + agents.seed, 12.0)
     columns = {}

@@ -20,8 +20,8 @@ pytestmark = pytest.mark.slow
 
 KILLS = 20
 
-TRAINED_LONG = ["--set", "steps=60000", "--shard-size", "2", "--snapshot-every", "0"]
-"""Two shards of a second or two, with snapshots as often as they are cheap."""
+TRAINED_LONG = ["--set", "steps=60000", "--shard-size", "2", "--checkpoint-every", "0"]
+"""Two shards of a second or two, with checkpoints as often as they are cheap."""
 
 
 @pytest.fixture(scope="module")
@@ -34,19 +34,19 @@ def folder(tmp_path_factory):
 
 def test_the_uninterrupted_run_takes_snapshots_and_tidies_up(folder):
     run = json.loads((folder / "whole" / "run.json").read_text())
-    assert run["seconds"]["snapshot"] > 0
-    assert len(events(folder / "whole", "snapshot")) >= 2
+    assert run["seconds"]["checkpoint"] > 0
+    assert len(events(folder / "whole", "checkpoint")) >= 2
     assert not (folder / "whole" / "shards").exists()
 
 
 def test_killed_twenty_times_it_ends_with_the_same_bits(folder):
-    """SIGKILL at random moments: while it starts, trains, writes a snapshot, judges, puts the results together."""
+    """SIGKILL at random opt_state: while it starts, trains, writes a checkpoint, judges, puts the results together."""
     chance = random.Random(5)
     kills, runs, restored = 0, 0, 0
     while kills < KILLS:
         runs += 1
         out = folder / f"killed-{runs}"
-        arguments = ["run", "tiny.toml", *TRAINED_LONG, "--snapshot-share", "0.5", "--out", out.name]
+        arguments = ["run", "tiny.toml", *TRAINED_LONG, "--checkpoint-share", "0.5", "--out", out.name]
         while True:
             process = start(*arguments, cwd=folder)
             if kills < KILLS:
@@ -83,13 +83,13 @@ def lines_told(out):
 
 
 def test_told_to_stop_it_keeps_all_and_says_how_to_go_on(folder):
-    process = start("run", "tiny.toml", *TRAINED_LONG, "--snapshot-every", "3600", "--out", "told", cwd=folder)
+    process = start("run", "tiny.toml", *TRAINED_LONG, "--checkpoint-every", "3600", "--out", "told", cwd=folder)
     wait_for(lambda: len(events(folder / "told", "chunk")) > 20, process)
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 143
     assert "go on with: uavmec resume told" in errors
-    (kept,) = events(folder / "told", "snapshot")
+    (kept,) = events(folder / "told", "checkpoint")
     assert events(folder / "told", "chunk")[-1]["steps"] == kept["steps"]
     uavmec("resume", "told", cwd=folder)
     (restored,) = events(folder / "told", "restored")
@@ -145,12 +145,12 @@ def test_workers_of_a_cluster(folder):
 
 
 def test_a_full_disk_is_said_and_the_snapshot_before_is_used(folder):
-    """A limit on the size of files stands in for it: the log and small files fit, a snapshot does not."""
+    """A limit on the size of files stands in for it: the log and small files fit, a checkpoint does not."""
     out = "full"
-    often = ["--snapshot-share", "0.5"]
+    often = ["--checkpoint-share", "0.5"]
     process = start("run", "tiny.toml", *TRAINED_LONG, *often, "--out", out, cwd=folder)
-    wait_for(lambda: len(events(folder / out, "snapshot")) > 1, process)
-    size = events(folder / out, "snapshot")[0]["bytes"]
+    wait_for(lambda: len(events(folder / out, "checkpoint")) > 1, process)
+    size = events(folder / out, "checkpoint")[0]["bytes"]
     resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (size // 2, size // 2))
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 2

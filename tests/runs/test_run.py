@@ -12,7 +12,7 @@ from uavmec_jax.errors import PolicyError, StudyError
 from uavmec_jax.reporting import canvas, figures, tables
 from uavmec_jax.runs.results_folder import check_directory, load_results
 from uavmec_jax.runs.run import resume_run, run_study
-from uavmec_jax.runs.run_plan import BYTES_WITHOUT_TRAINING, plan_study
+from uavmec_jax.runs.run_plan import BYTES_WITHOUT_TRAINING, plan_run
 from uavmec_jax.studies.results_files import load_weights
 from uavmec_jax.studies.study import parse_study
 from uavmec_jax.training import host
@@ -189,7 +189,7 @@ def test_the_figure_of_heuristics_alone(powered):
 
 def leave_room_for(agents, study, monkeypatch):
     """Pretend that the host has memory for so many agents in training."""
-    plan = plan_study(study)
+    plan = plan_run(study)
     free = BYTES_WITHOUT_TRAINING * plan.agents + agents * plan.blocks["dqn"].bytes // plan.blocks["dqn"].size
     monkeypatch.setattr(host, "free_memory", lambda: free)
 
@@ -199,7 +199,7 @@ def test_blocks_one_after_the_other_give_every_agent_once(finished, monkeypatch)
     study = finished[0].study
     study = study.model_copy(update={"evaluation": study.evaluation.model_copy(update={"planners": ()})})
     leave_room_for(2, study, monkeypatch)
-    assert len(plan_study(study).shards) == 4
+    assert len(plan_run(study).shards) == 4
     pieces = run_study(study)
     assert pieces.run["complete"]
     pd.testing.assert_frame_equal(pieces.agents.iloc[:, :3], finished[0].agents.iloc[:, :3])
@@ -211,7 +211,7 @@ def test_blocks_one_after_the_other_give_every_agent_once(finished, monkeypatch)
 def test_interrupted_run_keeps_the_finished_blocks(finished, monkeypatch, tmp_path):
     study = parse_study(TOML, "tiny", {"evaluation.planners": [], "evaluation.baselines": []})
     leave_room_for(4, study, monkeypatch)
-    assert len(plan_study(study).shards) == 2
+    assert len(plan_run(study).shards) == 2
 
     def interrupt(progress):
         if progress.block == 1:
@@ -226,7 +226,7 @@ def test_run_that_does_not_fit_is_refused_before_anything_is_written(finished, m
     with pytest.raises(StudyError, match=r"tiny: steps is 2000000000: one agent needs"):
         run_study(parse_study(TOML, "tiny", {"steps": 2 * 10**9, "dqn.replay_capacity": 2 * 10**9}), tmp_path / "big")
     with pytest.raises(StudyError, match=r"8,000,000,000 agents need .* GiB of memory, and as much disk"):
-        plan_study(parse_study(TOML, "tiny", {"axes.seeds": 2 * 10**9}))
+        plan_run(parse_study(TOML, "tiny", {"axes.seeds": 2 * 10**9}))
     assert not (tmp_path / "big").exists()
 
 

@@ -13,7 +13,7 @@ from tests.runs.processes import FINAL, TINY, Enough, bits, events, stop_after
 from uavmec_jax.errors import StudyError
 from uavmec_jax.runs import folder as folders
 from uavmec_jax.runs import run as running
-from uavmec_jax.runs.folder import Durability, RunFolder
+from uavmec_jax.runs.folder import RunFolder, RunOptions
 from uavmec_jax.runs.results_folder import load_results
 from uavmec_jax.runs.run import resume_run, run_study
 from uavmec_jax.runs.shared_run import prepare_run, work_on
@@ -23,7 +23,7 @@ from uavmec_jax.studies.study import parse_study
 pytestmark = pytest.mark.slow
 
 STUDY = parse_study(TINY, "tiny")
-OFTEN = Durability(snapshot_every_s=0.0)
+OFTEN = RunOptions(checkpoint_every_s=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -35,9 +35,9 @@ def whole(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def stopped(tmp_path_factory):
-    """The first shard is finished, the second one has two snapshots."""
+    """The first shard is finished, the second one has two checkpoints."""
     directory = tmp_path_factory.mktemp("stopped") / "run"
-    results = run_study(STUDY, directory, shard_size=2, command="x", durability=OFTEN, on_progress=stop_after(50))
+    results = run_study(STUDY, directory, shard_size=2, command="x", options=OFTEN, on_progress=stop_after(50))
     assert results.run["stopped_by"] == 2
     assert len(results.agents) == 2
     running.resume_run(directory, on_progress=stop_after(6))
@@ -54,13 +54,13 @@ def flip(path, where=0.5):
     path.write_bytes(bytes(data))
 
 
-def snapshots(directory):
-    return sorted((directory / "shards" / "00001").glob("snapshot-*.npz"))
+def checkpoints(directory):
+    return sorted((directory / "shards" / "00001").glob("checkpoint-*.npz"))
 
 
 def test_stopped_anywhere_it_ends_with_the_same_bits(whole, stopped, tmp_path):
     directory = copied(stopped, tmp_path)
-    assert len(snapshots(directory)) == 2
+    assert len(checkpoints(directory)) == 2
     results = resume_run(directory)
     assert results.run["complete"]
     assert bits(directory) == bits(whole)
@@ -82,7 +82,7 @@ def load_results_exact(directory):
 @pytest.mark.parametrize("damage", [flip, lambda path: path.write_bytes(path.read_bytes()[:-900])], ids=["bit", "end"])
 def test_a_damaged_snapshot_is_named_and_the_one_before_is_used(whole, stopped, tmp_path, damage):
     directory = copied(stopped, tmp_path)
-    older, newest = snapshots(directory)
+    older, newest = checkpoints(directory)
     damage(newest)
     resume_run(directory)
     (told,) = events(directory, "damaged")
@@ -94,7 +94,7 @@ def test_a_damaged_snapshot_is_named_and_the_one_before_is_used(whole, stopped, 
 def test_without_a_sound_snapshot_the_shard_starts_again(whole, stopped, tmp_path):
     directory = copied(stopped, tmp_path)
     before = len(events(directory, "restored"))
-    for path in snapshots(directory):
+    for path in checkpoints(directory):
         flip(path)
     resume_run(directory)
     assert len(events(directory, "damaged")) == 2
@@ -105,9 +105,9 @@ def test_without_a_sound_snapshot_the_shard_starts_again(whole, stopped, tmp_pat
 def test_a_snapshot_of_another_shard_or_run_is_not_used(whole, stopped, tmp_path):
     directory = copied(stopped, tmp_path)
     other = tmp_path / "other"
-    run_study(STUDY, other, command="y", shard_size=2, durability=OFTEN, on_progress=stop_after(4))
-    (foreign, *_) = sorted((other / "shards" / "00000").glob("snapshot-*.npz"))
-    shutil.copy(foreign, snapshots(directory)[-1])
+    run_study(STUDY, other, command="y", shard_size=2, options=OFTEN, on_progress=stop_after(4))
+    (foreign, *_) = sorted((other / "shards" / "00000").glob("checkpoint-*.npz"))
+    shutil.copy(foreign, checkpoints(directory)[-1])
     resume_run(directory)
     assert "is of another run" in events(directory, "damaged")[0]["error"]
     assert bits(directory) == bits(whole)
@@ -146,11 +146,11 @@ def test_damaged_logs_and_leases_do_no_harm(whole, stopped, tmp_path):
         path.write_bytes(path.read_bytes()[:20])
     path = directory / "plan.json"
     facts = json.loads(path.read_text())
-    facts["durability"]["lease_s"] = 0.5
+    facts["options"]["lease_s"] = 0.5
     facts["sha256"] = folders._digest(facts)
     path.write_text(json.dumps(facts))
-    for snapshot in snapshots(directory):
-        snapshot.unlink()  # they are of the plan as it was
+    for checkpoint in checkpoints(directory):
+        checkpoint.unlink()  # they are of the plan as it was
     resume_run(directory)
     assert bits(directory) == bits(whole)
 
@@ -209,7 +209,7 @@ def test_workers_share_a_run_and_the_last_one_puts_it_together(whole, tmp_path):
 
 
 def test_a_shard_that_fails_does_not_stop_the_others(whole, tmp_path, monkeypatch):
-    start = running.Bench.start
+    start = running.ShardRunner.start
 
     def broken(self, shard):
         if shard.number == 0:
@@ -217,7 +217,7 @@ def test_a_shard_that_fails_does_not_stop_the_others(whole, tmp_path, monkeypatc
         return start(self, shard)
 
     with monkeypatch.context() as patch:
-        patch.setattr(running.Bench, "start", broken)
+        patch.setattr(running.ShardRunner, "start", broken)
         with pytest.raises(StudyError, match=r"1 of 2 shards failed, shard 0 with ZeroDivisionError: by zero .*resume"):
             run_study(STUDY, tmp_path / "run", command="x", shard_size=2)
     status = run_status(tmp_path / "run")
@@ -228,9 +228,9 @@ def test_a_shard_that_fails_does_not_stop_the_others(whole, tmp_path, monkeypatc
 
 
 def test_weights_snapshots_are_policies_and_the_shard_starts_again(whole, tmp_path):
-    light = Durability(snapshot="weights", snapshot_every_s=0.0, snapshot_share=1.0)
-    run_study(STUDY, tmp_path / "run", command="x", shard_size=2, durability=light, on_progress=stop_after(10))
-    older, newest = sorted((tmp_path / "run" / "shards" / "00000").glob("snapshot-*.npz"))
+    light = RunOptions(checkpoint="weights", checkpoint_every_s=0.0, checkpoint_share=1.0)
+    run_study(STUDY, tmp_path / "run", command="x", shard_size=2, options=light, on_progress=stop_after(10))
+    older, newest = sorted((tmp_path / "run" / "shards" / "00000").glob("checkpoint-*.npz"))
     policy = um.load_policy(newest, seed=0, powered=12)
     layout = um.sample_layout(jax.random.key(0), um.Params(), 12, 8)
     assert 0 <= policy(um.Params(), layout, um.initial_state(um.Params(), layout)) < 12

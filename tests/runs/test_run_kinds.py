@@ -4,7 +4,7 @@ import pytest
 
 from tests.runs.processes import TINY, events, stop_after
 from uavmec_jax.errors import StudyError
-from uavmec_jax.runs.folder import Durability
+from uavmec_jax.runs.folder import RunOptions
 from uavmec_jax.runs.run import resume_run, run_study
 from uavmec_jax.runs.shared_run import work_on
 from uavmec_jax.studies.study import parse_study
@@ -39,7 +39,7 @@ def test_agents_that_diverge_leave_the_others_alone(tmp_path):
 def test_curves_go_to_tensorboard_too(tmp_path):
     from tensorboardX.proto.event_pb2 import Event
 
-    run_study(STUDY, tmp_path / "run", durability=Durability(tensorboard=True))
+    run_study(STUDY, tmp_path / "run", options=RunOptions(tensorboard=True))
     (file,) = (tmp_path / "run" / "tensorboard" / "shard-00000").iterdir()
     data, values = file.read_bytes(), {}
     while data:

@@ -6,7 +6,7 @@ from tests.runs.processes import TINY
 from uavmec_jax.errors import StudyError
 from uavmec_jax.runs.checkpoints import interval_s
 from uavmec_jax.runs.run import run_study
-from uavmec_jax.runs.run_plan import plan_study
+from uavmec_jax.runs.run_plan import plan_run
 from uavmec_jax.runs.shared_run import prepare_run
 from uavmec_jax.runs.simulate import simulate
 from uavmec_jax.runs.status import run_status
@@ -18,13 +18,13 @@ def test_a_hundred_thousand_agents_are_planned_and_looked_at_without_making_one(
     def nobody(study):
         raise AssertionError("the agents were enumerated")
 
-    monkeypatch.setattr(studies, "identities", nobody)
+    monkeypatch.setattr(studies, "make_agent_ids", nobody)
     study = parse_study(TINY, "tiny", {"axes.seeds": 50_000})
     prepare_run(study, tmp_path / "run")
     status = run_status(tmp_path / "run")
     assert status.agents == 100_000
     assert status.shards["waiting"] > 1000
-    assert status.of_steps == 100_000 * 4000
+    assert status.total_steps == 100_000 * 4000
     assert [path.name for path in (tmp_path / "run" / "shards").iterdir()] == ["lease-0001.json"]
 
 
@@ -36,7 +36,7 @@ def test_large_snapshots_come_less_often():
 
 def test_a_population_beyond_all_memory_is_refused_with_an_estimate(tmp_path):
     study = parse_study(TINY, "tiny", {"axes.seeds": 500_000_000})
-    for use in (plan_study, lambda s: run_study(s, tmp_path / "run"), lambda s: prepare_run(s, tmp_path / "run")):
+    for use in (plan_run, lambda s: run_study(s, tmp_path / "run"), lambda s: prepare_run(s, tmp_path / "run")):
         with pytest.raises(StudyError, match=r"1,000,000,000 agents need 93,132 GiB of memory, and as much disk"):
             use(study)
     assert not (tmp_path / "run").exists()
@@ -44,7 +44,7 @@ def test_a_population_beyond_all_memory_is_refused_with_an_estimate(tmp_path):
 
 def test_a_simulation_adds_up():
     study = load_study("table5", {"axes.seeds": 8})  # 200 agents
-    plan = plan_study(study, shard_size=40)
+    plan = plan_run(study, shard_size=40)
     groups = plan.blocks["dqn"].groups
     one, two = (simulate(study, plan, speed=100_000, devices=n * groups) for n in (1, 2))
     assert one.training_s == pytest.approx(200 * 1_000_000 / (100_000 * groups), rel=0.01)

@@ -5,19 +5,19 @@ import signal
 
 import pytest
 
-from uavmec_jax.runs.signals import Stop, Stopped
+from uavmec_jax.runs.signals import Interrupted, StopSignal
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_is_noted_and_the_second_one_interrupts(number):
     before = signal.getsignal(number)
-    with Stop() as stop:
+    with StopSignal() as stop:
         stop.check()
         os.kill(os.getpid(), number)
-        with pytest.raises(Stopped) as stopped:
+        with pytest.raises(Interrupted) as stopped:
             stop.check()
         assert stopped.value.signal == number
-        with pytest.raises(Stopped):
+        with pytest.raises(Interrupted):
             os.kill(os.getpid(), number)
     assert signal.getsignal(number) == before
 
@@ -26,10 +26,10 @@ def test_at_once_means_at_once():
     def work(stop, before):
         if before:
             os.kill(os.getpid(), signal.SIGTERM)
-        with stop.at_once():
+        with stop.interruptible():
             os.kill(os.getpid(), signal.SIGTERM)
             raise AssertionError("too late")
 
     for before in (False, True):
-        with Stop() as stop, pytest.raises(Stopped):
+        with StopSignal() as stop, pytest.raises(Interrupted):
             work(stop, before)

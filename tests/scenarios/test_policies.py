@@ -18,7 +18,7 @@ from uavmec_jax.errors import PolicyError
 from uavmec_jax.planning.heuristics import HEURISTICS
 from uavmec_jax.runs.run import run_study
 from uavmec_jax.scenarios.policies import TrainedPolicy, load_policy
-from uavmec_jax.scenarios.policy_files import Collection, write_collection
+from uavmec_jax.scenarios.policy_files import PolicyCollection, write_policies
 from uavmec_jax.scenarios.seeds import held_out_draws, town
 from uavmec_jax.studies.schema import DQNSettings, PPOSettings
 from uavmec_jax.studies.study import parse_study
@@ -31,7 +31,7 @@ def collection_of(name, network, settings, agents):
     make = jax.jit(jax.vmap(lambda key: network.init(key, jnp.zeros((1, 24)))))
     kinds = {kind: make(jax.random.split(jax.random.key(i), len(agents))) for i, kind in enumerate(("best", "last"))}
     weights = traverse_util.flatten_dict({name: kinds}, sep="/")
-    return Collection(
+    return PolicyCollection(
         settings={name: settings.model_dump(mode="json")},
         n_devices=12,
         agents={name: agents},
@@ -45,7 +45,7 @@ def run(tmp_path_factory):
     directory = tmp_path_factory.mktemp("run")
     places = itertools.product((0, 1), (12, 4), (12, 4))
     agents = [dict(zip(("seed", "powered", "connected"), place, strict=True)) for place in places]
-    write_collection(
+    write_policies(
         directory / "weights.npz",
         collection_of("dqn", dqn.DQNSpec(hidden=(16,)).network, DQNSettings(hidden=(16,)), agents),
     )

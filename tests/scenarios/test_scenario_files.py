@@ -9,10 +9,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from uavmec_jax.env.hardware import ACTIVE_POWER_W, PROCESSING_RATE_BYTES_S, STANDBY_POWER_W
 from uavmec_jax.env.params import Params
-from uavmec_jax.errors import LayoutError
-from uavmec_jax.scenarios.named_scenario import OWN, inventory_of
-from uavmec_jax.scenarios.scenario_files import inventory_text, load_inventory
+from uavmec_jax.errors import ScenarioError
+from uavmec_jax.scenarios.named_scenario import name_scenario
+from uavmec_jax.scenarios.scenario_files import load_scenario_file, scenario_text
 from uavmec_jax.scenarios.seeds import town
+from uavmec_jax.search.confirm import OWN
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 ONE = """
@@ -33,7 +34,7 @@ def written(tmp_path, text, name="town.toml"):
 
 
 def test_degrees_become_metres_and_own_hardware_is_taken():
-    harbour = load_inventory(EXAMPLES / "harbour.toml")
+    harbour = load_scenario_file(EXAMPLES / "harbour.toml")
     assert harbour.names[2] == "tide gauge"
     layout = harbour.layout
     assert layout.device_type.tolist() == [3, 0, OWN, 2, 4, 2]
@@ -52,34 +53,34 @@ def test_degrees_become_metres_and_own_hardware_is_taken():
 
 
 def test_toml_reads_back_to_the_same(tmp_path):
-    harbour = load_inventory(EXAMPLES / "harbour.toml")
-    again = load_inventory(written(tmp_path, inventory_text(harbour)))
+    harbour = load_scenario_file(EXAMPLES / "harbour.toml")
+    again = load_scenario_file(written(tmp_path, scenario_text(harbour)))
     assert again.file == harbour.file
     jax.tree.map(assert_array_equal, again.layout, harbour.layout)
 
 
 def test_csv_reads_back_to_the_same(tmp_path):
-    village = load_inventory(EXAMPLES / "village.csv")
+    village = load_scenario_file(EXAMPLES / "village.csv")
     assert village.layout.has_power.tolist() == [False, False, True, False]
-    again = load_inventory(written(tmp_path, inventory_text(village, ".csv"), "village.csv"))
+    again = load_scenario_file(written(tmp_path, scenario_text(village, ".csv"), "village.csv"))
     assert again.file == village.file
-    as_toml = load_inventory(written(tmp_path, inventory_text(village), "village.toml"))
+    as_toml = load_scenario_file(written(tmp_path, scenario_text(village), "village.toml"))
     jax.tree.map(assert_array_equal, as_toml.layout, village.layout)
-    with pytest.raises(LayoutError, match="a CSV has no place for params"):
-        inventory_text(load_inventory(EXAMPLES / "harbour.toml"), ".csv")
+    with pytest.raises(ScenarioError, match="a CSV has no place for params"):
+        scenario_text(load_scenario_file(EXAMPLES / "harbour.toml"), ".csv")
 
 
 def test_a_random_town_reads_back_to_the_same(tmp_path):
     params = Params(region_m=(500.0, 300.0))
     layout = town(4, params, 5, 7)
-    again = load_inventory(written(tmp_path, inventory_text(inventory_of(layout, params, "town"))))
+    again = load_scenario_file(written(tmp_path, scenario_text(name_scenario(layout, params, "town"))))
     jax.tree.map(assert_array_equal, again.layout, layout)
     assert again.params == params
 
 
 def test_a_place_on_the_map_is_needed_for_degrees():
-    with pytest.raises(LayoutError, match="has no place on the map; give origin"):
-        load_inventory(EXAMPLES / "village.csv").geographic(np.zeros(2))
+    with pytest.raises(ScenarioError, match="has no place on the map; give origin"):
+        load_scenario_file(EXAMPLES / "village.csv").geographic(np.zeros(2))
 
 
 BAD = {
@@ -116,8 +117,8 @@ BAD = {
 
 @pytest.mark.parametrize(("text", "message"), BAD.values(), ids=BAD)
 def test_bad_inventory_is_one_clear_line(tmp_path, text, message):
-    with pytest.raises(LayoutError) as error:
-        load_inventory(written(tmp_path, text))
+    with pytest.raises(ScenarioError) as error:
+        load_scenario_file(written(tmp_path, text))
     assert message in str(error.value)
     assert str(error.value).startswith(str(tmp_path / "town.toml"))
     assert "\n" not in str(error.value)
@@ -136,13 +137,13 @@ def test_bad_inventory_is_one_clear_line(tmp_path, text, message):
     ],
 )
 def test_bad_csv_is_one_clear_line(tmp_path, text, message):
-    with pytest.raises(LayoutError) as error:
-        load_inventory(written(tmp_path, text, "town.csv"))
+    with pytest.raises(ScenarioError) as error:
+        load_scenario_file(written(tmp_path, text, "town.csv"))
     assert message in str(error.value)
 
 
 def test_files_that_are_none(tmp_path):
-    with pytest.raises(LayoutError, match=r"cannot be read: No such file"):
-        load_inventory(tmp_path / "none.toml")
-    with pytest.raises(LayoutError, match=r"ends in .toml or .csv"):
-        load_inventory(tmp_path / "none.json")
+    with pytest.raises(ScenarioError, match=r"cannot be read: No such file"):
+        load_scenario_file(tmp_path / "none.toml")
+    with pytest.raises(ScenarioError, match=r"ends in .toml or .csv"):
+        load_scenario_file(tmp_path / "none.json")

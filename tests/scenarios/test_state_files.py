@@ -9,10 +9,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from tests.scenarios.test_scenario_files import EXAMPLES
 from uavmec_jax.env.dynamics import initial_state
 from uavmec_jax.errors import StateError
-from uavmec_jax.scenarios.scenario_files import load_inventory
+from uavmec_jax.scenarios.scenario_files import load_scenario_file
 from uavmec_jax.scenarios.state_files import load_state, make_state, state_data
 
-HARBOUR = load_inventory(EXAMPLES / "harbour.toml")
+HARBOUR = load_scenario_file(EXAMPLES / "harbour.toml")
 NAMES = HARBOUR.names
 CAPACITY = np.asarray(HARBOUR.layout.capacity, float).tolist()
 

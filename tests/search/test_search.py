@@ -9,7 +9,7 @@ from tests.runs.processes import TINY
 from uavmec_jax.errors import StudyError
 from uavmec_jax.reporting.search import history_figure, importance_figure, search_json, search_tables
 from uavmec_jax.search.confirm import confirm
-from uavmec_jax.search.halving import Brackets
+from uavmec_jax.search.halving import SuccessiveHalving
 from uavmec_jax.search.search import search
 from uavmec_jax.search.space import load_space, settings_of
 from uavmec_jax.studies.compare import overall, pair
@@ -91,8 +91,8 @@ def test_a_search_that_is_stopped_ends_as_one_that_is_not(space, tmp_path):
 @pytest.mark.slow
 def test_those_that_go_on_are_not_changed_by_those_that_are_given_up(space):
     trials = [{"learning_rate": rate, "reward.M": 0.0} for rate in (1e-4, 3e-4, 1e-3, 1e30)]
-    halved = Brackets(space).run(trials)
-    whole = Brackets(space.model_copy(update={"halving": type(space.halving)()})).run(trials)
+    halved = SuccessiveHalving(space).run(trials)
+    whole = SuccessiveHalving(space.model_copy(update={"halving": type(space.halving)()})).run(trials)
     assert [outcome.value is None for outcome in halved].count(True) == 2
     assert halved[3].value is None
     for one, other in zip(halved, whole, strict=True):
@@ -104,7 +104,7 @@ def test_those_that_go_on_are_not_changed_by_those_that_are_given_up(space):
 def test_the_shipped_space():
     space = load_space("dqn")
     assert space.base().name == "table5"
-    assert Brackets(space).towns == 20
+    assert SuccessiveHalving(space).towns == 20
     changes = settings_of(space, {"learning_rate": 0.001, "reward.U": 0.5})
     assert changes["dqn.learning_rate"] == 0.001
     assert changes["reward"] == {"U": 0.5, "log A": 1.0, "log O": -1.0}

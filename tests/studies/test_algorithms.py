@@ -8,8 +8,8 @@ from numpy.testing import assert_array_equal
 from uavmec_jax.errors import StudyError
 from uavmec_jax.runs.results_folder import load_results
 from uavmec_jax.runs.run import run_study
-from uavmec_jax.runs.run_plan import plan_study
-from uavmec_jax.studies.evaluation import Distinct, Judgement
+from uavmec_jax.runs.run_plan import plan_run
+from uavmec_jax.studies.evaluation import DistinctScenarios, EvaluationResult
 from uavmec_jax.studies.results_files import load_weights
 from uavmec_jax.studies.study import parse_study
 from uavmec_jax.training.population import Progress
@@ -44,14 +44,14 @@ baselines = ["oldest-first"]
 @pytest.mark.slow
 def test_one_study_trains_each_algorithm_as_one_program(tmp_path):
     study = parse_study(TOML, "three")
-    plan = plan_study(study)
+    plan = plan_run(study)
     assert plan.agents == 3 * 2 * 2 * 3  # the reward U has one guard
     assert list(plan.blocks) == ["dqn", "ppo", "a2c"]
     news: list[Progress] = []
     results = run_study(study, tmp_path / "run", on_progress=news.append)
     assert results.run["complete"]
     assert [one.steps for one in news] == sorted(one.steps for one in news)
-    assert news[-1].steps == news[-1].of_steps == plan.total_steps == results.run["environment_steps"]
+    assert news[-1].steps == news[-1].total_steps == plan.total_steps == results.run["environment_steps"]
     assert {one.block for one in news} == {0, 1, 2}
     assert results.agents["algorithm"].tolist() == ["dqn"] * 12 + ["ppo"] * 12 + ["a2c"] * 12
     assert results.agents.groupby("algorithm")["steps"].first().to_dict() == {"dqn": 640, "ppo": 640, "a2c": 640}
@@ -101,10 +101,10 @@ def test_a_function_beside_an_axis_of_rewards_is_refused():
 
 def test_distinct_scenarios():
     played = pd.DataFrame({"seed": [1, 1, 0, 1], "powered": [8, 6, 8, 8]})
-    distinct = Distinct.of(played)
+    distinct = DistinctScenarios.of(played)
     assert_array_equal(distinct.first, [0, 1, 2])
     assert_array_equal(distinct.scenario, [0, 1, 2, 0])
     assert_array_equal(distinct.longest(np.array([[3, 1], [5, 5], [2, 2], [1, 4]])), [[3, 4], [5, 5], [2, 2]])
-    judged = Judgement(np.array([[7, 8], [9, 9], [1, 2]]), np.zeros((3, 2), np.int8), np.zeros((3, 2, 4)))
+    judged = EvaluationResult(np.array([[7, 8], [9, 9], [1, 2]]), np.zeros((3, 2), np.int8), np.zeros((3, 2, 4)))
     assert_array_equal(distinct.to_agents(judged).lifetime, [[7, 8], [9, 9], [1, 2], [7, 8]])
     assert distinct.to_agents(judged).first_failure.shape == (4, 2, 4)

@@ -15,7 +15,7 @@ from uavmec_jax.studies.compare import (
     pair,
     probability_of_improvement,
 )
-from uavmec_jax.studies.population import identities
+from uavmec_jax.studies.population import make_agent_ids
 from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.study import parse_study
 
@@ -37,7 +37,7 @@ def test_measures_are_those_of_rliable():
 def fake(text, lifetime, name="fake"):
     """Results whose agents live as long as ``lifetime`` says."""
     study = parse_study(text, name)
-    agents = pd.DataFrame(identities(study))
+    agents = pd.DataFrame(make_agent_ids(study))
     return Results(study=study, run={}, agents=agents.assign(best_lifetime=agents.apply(lifetime, axis=1)))
 
 

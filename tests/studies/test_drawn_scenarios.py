@@ -15,9 +15,9 @@ from uavmec_jax.env.layout import sample_layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.errors import PolicyError, StudyError
 from uavmec_jax.runs.run import run_study
-from uavmec_jax.scenarios.distribution import unlike
+from uavmec_jax.scenarios.distribution import out_of_distribution
 from uavmec_jax.scenarios.policies import load_policy
-from uavmec_jax.studies.population import evaluation_keys, identities, make_agents, validation_keys
+from uavmec_jax.studies.population import evaluation_keys, make_agent_ids, make_agents, validation_keys
 from uavmec_jax.studies.study import load_study, parse_study, study_toml
 
 TOML = """
@@ -55,7 +55,7 @@ def study_of(text=TOML, **overrides):
 
 def test_all_agents_are_judged_in_the_same_scenarios():
     study = study_of()
-    assert identities(study) == [{"seed": 0, "scenarios": "drawn"}, {"seed": 1, "scenarios": "drawn"}]
+    assert make_agent_ids(study) == [{"seed": 0, "scenarios": "drawn"}, {"seed": 1, "scenarios": "drawn"}]
     for keys in (validation_keys(study), evaluation_keys(study)):
         first, second = jax.random.key_data(keys)
         assert_array_equal(first, second)
@@ -173,9 +173,9 @@ def test_what_is_unlike_the_training_is_named():
     scenarios, trained = study.scenarios.model_dump(), study.params.model_dump()
     params = Params()
     layout = sample_layout(jax.random.key(0), params, 8, 8)
-    assert unlike(scenarios, trained, params, layout) == []
+    assert out_of_distribution(scenarios, trained, params, layout) == []
     far = Params(n_devices=40, data_age_limit_slots=20, uav_speed_m_s=9.0, region_m=(9000.0, 9000.0))
-    found = unlike(scenarios, trained, far, sample_layout(jax.random.key(0), far, 8, 8))
+    found = out_of_distribution(scenarios, trained, far, sample_layout(jax.random.key(0), far, 8, 8))
     named = [line.split(":")[0] for line in found]
     assert named == ["devices", "extent in m", "the UAV's speed in m/s", "data_age_limit_slots"]
     assert found[0] == "devices: 40; it was trained on 4 to 16"

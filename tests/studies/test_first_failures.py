@@ -1,4 +1,4 @@
-"""Who fails first, and the test of the paper's claim, on invented failures."""
+"""AgentIds fails first, and the test of the paper's claim, on invented failures."""
 
 import io
 
@@ -20,7 +20,7 @@ from uavmec_jax.studies.first_failures import (
 )
 from uavmec_jax.studies.paper import TABLE7
 from uavmec_jax.studies.places import describe_places
-from uavmec_jax.studies.population import identities
+from uavmec_jax.studies.population import make_agent_ids
 from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.statistics import sign_test
 from uavmec_jax.studies.study import load_study
@@ -31,7 +31,7 @@ def results():
     """Ten seeds: everywhere device 2 (high traffic in both places) fails first, but with a penalty device 9, at a slot's
     price; seed 0 is stubborn. The bonus changes nothing."""
     study = load_study("table7", {"axes.seeds": 10})
-    agents = pd.DataFrame(identities(study))
+    agents = pd.DataFrame(make_agent_ids(study))
     spared = (agents.traffic_penalty > 0) & (agents.seed > 0)
     share = np.zeros((len(agents), 3, 12), np.float32)
     share[np.arange(len(agents)), :, np.where(spared, 8, 1)] = 1

@@ -10,10 +10,10 @@ from uavmec_jax.errors import StudyError, TrafficError
 from uavmec_jax.reporting.tables import tables
 from uavmec_jax.runs.results_folder import load_results
 from uavmec_jax.runs.run import run_study
-from uavmec_jax.runs.run_plan import plan_study
+from uavmec_jax.runs.run_plan import plan_run
 from uavmec_jax.scenarios.load import load_scenario
 from uavmec_jax.scenarios.policies import load_policy
-from uavmec_jax.studies.population import cell_axes, identities, make_agents
+from uavmec_jax.studies.population import cell_axes, make_agent_ids, make_agents
 from uavmec_jax.studies.study import load_study, parse_study, study_toml
 from uavmec_jax.traffic.evacuation import load_evacuation
 
@@ -37,7 +37,7 @@ planners = ["rollout"]
 def test_agents_stand_where_the_devices_of_the_place_do():
     study = parse_study(TOML, "x")
     assert cell_axes(study) == ["powered", "connected", "place", "traffic_bonus"]
-    who, agents = identities(study), make_agents(study)
+    who, agents = make_agent_ids(study), make_agents(study)
     places = {name: load_evacuation(name) for name in ("round_lake", "albany")}
     for k, agent in enumerate(who):
         place = places[agent["place"]]
@@ -78,7 +78,7 @@ def test_a_study_of_places_is_written_and_read_back():
     assert parse_study(study_toml(study), "x") == study
     assert parse_study(study_toml(parse_study(TOML, "x")), "x") == parse_study(TOML, "x")
     for name, agents in (("table7", 240), ("table7-ppo", 120)):
-        assert len(identities(load_study(name))) == agents
+        assert len(make_agent_ids(load_study(name))) == agents
 
 
 @pytest.mark.parametrize(
@@ -103,7 +103,7 @@ def test_a_study_of_places_is_written_and_read_back():
 )
 def test_what_does_not_fit_is_one_line(changes, line):
     with pytest.raises((StudyError, TrafficError)) as caught:
-        plan_study(parse_study(TOML, "x", changes))
+        plan_run(parse_study(TOML, "x", changes))
     assert line in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -116,12 +116,12 @@ def test_traffic_without_a_place_is_refused():
 
 
 def test_a_scenario_of_a_place():
-    inventory, keys = load_scenario(None, place="albany", powered=8, connected=6, seed=3, draws=2)
+    named_scenario, keys = load_scenario(None, place="albany", powered=8, connected=6, seed=3, draws=2)
     place = load_evacuation("albany")
-    assert inventory.names == place.meta["names"]
-    assert_allclose(inventory.layout.position, place.local_position(), atol=1e-3)
-    assert inventory.params.region_m == pytest.approx(place.region_m())
-    assert int(np.sum(inventory.layout.has_power)) == 8
+    assert named_scenario.names == place.meta["names"]
+    assert_allclose(named_scenario.layout.position, place.local_position(), atol=1e-3)
+    assert named_scenario.params.region_m == pytest.approx(place.region_m())
+    assert int(np.sum(named_scenario.layout.has_power)) == 8
     assert keys.shape == (2,)
     with pytest.raises(TrafficError, match="slot_cap_s"):
         load_scenario(None, place="albany", settings={"uav_speed_m_s": 1.0})
@@ -143,7 +143,7 @@ def test_a_run_from_end_to_end(tmp_path):
     )
     assert len(fixed.agents) == 1
     assert load_policy(tmp_path / "fixed", place="albany").trained_on["place"] == "albany"
-    # Who learns nothing plays the same whatever a learner is paid for.
+    # AgentIds learns nothing plays the same whatever a learner is paid for.
     oldest = results.agents.pivot_table(
         index=["seed", "place"], columns="traffic_bonus", values="oldest_first_lifetime"
     )

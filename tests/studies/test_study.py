@@ -11,7 +11,7 @@ from uavmec_jax.studies import study as studies
 from uavmec_jax.studies.paper import TABLE6
 from uavmec_jax.studies.population import (
     evaluation_keys,
-    identities,
+    make_agent_ids,
     make_agents,
     make_algorithm,
     n_agents,
@@ -29,13 +29,13 @@ seeds = 2
 """
 
 
-@pytest.mark.parametrize("name", sorted(studies.shipped()))
+@pytest.mark.parametrize("name", sorted(studies.shipped_studies()))
 def test_shipped_studies_are_valid_and_round_trip(name):
     study = load_study(name)
     assert study.name == name
     assert parse_study(study_toml(study), "again") == study
     sizes = {"planning": 2500, "table6": 675, "table7": 240, "table7-ppo": 120, "generalist": 2}
-    assert n_agents(study) == len(identities(study)) == sizes.get(name, 250)
+    assert n_agents(study) == len(make_agent_ids(study)) == sizes.get(name, 250)
 
 
 def test_table5_is_the_paper():
@@ -51,7 +51,7 @@ def test_table5_is_the_paper():
 
 def test_population_is_the_product_of_the_axes():
     study = parse_study(SMALL, "small", {"axes.learning_rate": [0.01, 0.001, 0.1], "axes.reward": ["A", "U"]})
-    who = identities(study)
+    who = make_agent_ids(study)
     assert len(who) == 2 * 2 * 3 * 2
     assert list(who[0]) == ["seed", "powered", "connected", "learning_rate", "reward"]
     agents = make_agents(study)
@@ -65,7 +65,7 @@ def test_population_is_the_product_of_the_axes():
 
 def test_an_agent_is_who_it_is_whoever_trains_beside_it():
     few, many = parse_study(SMALL, "x"), parse_study(SMALL, "x", {"axes.powered": [12, 8, 4], "axes.seeds": [7, 1]})
-    place = [(i, j) for i, a in enumerate(identities(few)) for j, b in enumerate(identities(many)) if a == b]
+    place = [(i, j) for i, a in enumerate(make_agent_ids(few)) for j, b in enumerate(make_agent_ids(many)) if a == b]
     assert len(place) == 2  # seed 1, powered 8 and 4
     mine, theirs = ([p[k] for p in place] for k in (0, 1))
     for make in (lambda s: make_agents(s).scenario.layout.position, lambda s: jax.random.key_data(make_agents(s).key)):
@@ -189,7 +189,7 @@ def test_missing_axis():
 def test_not_toml_and_not_there(tmp_path):
     with pytest.raises(StudyError, match="x: not TOML"):
         parse_study("steps = = 3", "x")
-    with pytest.raises(StudyError, match=r"neither a study file nor a shipped study; did you mean 'table5'"):
+    with pytest.raises(StudyError, match=r"neither a study file nor a shipped_studies study; did you mean 'table5'"):
         load_study("tabel5")
     with pytest.raises(StudyError, match="no such file"):
         load_study(tmp_path / "none.toml")
@@ -217,7 +217,7 @@ def test_bad_cells(cells, message):
 
 def test_cells_are_pairs():
     study = parse_study(CELLS, "x")
-    who = identities(study)
+    who = make_agent_ids(study)
     assert [(one["seed"], one["powered"], one["connected"]) for one in who] == [
         (0, 6, 6), (0, 10, 8), (2, 6, 6), (2, 10, 8)
     ]  # fmt: skip
@@ -227,8 +227,8 @@ def test_cells_are_pairs():
 
 def test_algorithms_are_cut_into_parts_of_one_program_each():
     study = parse_study(CELLS, "x", {"axes.algorithm": ["a2c", "dqn"], "axes.gamma": [0.9, 0.98], "a2c.vf_coef": 0.3})
-    assert n_agents(study) == len(identities(study)) == 16
-    assert [one["algorithm"] for one in identities(study)] == ["a2c"] * 8 + ["dqn"] * 8
+    assert n_agents(study) == len(make_agent_ids(study)) == 16
+    assert [one["algorithm"] for one in make_agent_ids(study)] == ["a2c"] * 8 + ["dqn"] * 8
     a2c, dqn = parts(study)
     assert (make_algorithm(a2c).name, make_algorithm(dqn).name) == ("a2c", "dqn")
     agents, others = make_agents(a2c), make_agents(dqn)
@@ -243,9 +243,9 @@ def test_algorithms_are_cut_into_parts_of_one_program_each():
 def test_a_reward_without_ages_in_logarithms_has_one_guard():
     rewards = ["A", "log A", "log M", {"log O": -1.0}]
     study = parse_study(CELLS, "x", {"axes.reward": rewards[:3], "axes.guard": ["log1p", "clamp"]})
-    pairs = {(one["reward"], one["guard"]) for one in identities(study)}
+    pairs = {(one["reward"], one["guard"]) for one in make_agent_ids(study)}
     assert pairs == {("A", "log1p"), ("log A", "log1p"), ("log A", "clamp"), ("log M", "log1p")}
-    assert n_agents(study) == len(identities(study)) == 4 * 4
+    assert n_agents(study) == len(make_agent_ids(study)) == 4 * 4
     assert not make_agents(study).scenario.reward.log1p.all()
 
 
@@ -253,6 +253,6 @@ def test_table6_is_the_papers_table():
     study = load_study("table6")
     assert n_agents(study) == 3 * 3 * 5 * (11 + 4)
     assert study.axes["reward"] == list(REWARDS)
-    wanted = {(one["reward"], one["powered"], one["connected"], one["algorithm"]) for one in identities(study)}
+    wanted = {(one["reward"], one["powered"], one["connected"], one["algorithm"]) for one in make_agent_ids(study)}
     assert wanted == set(TABLE6)
     assert max(TABLE6.values()) == 30  # U+log(A/O), 10 powered, 8 connected, DQN

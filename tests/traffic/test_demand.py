@@ -1,4 +1,4 @@
-"""Who drives where and when."""
+"""AgentIds drives where and when."""
 
 import xml.etree.ElementTree as ElementTree
 

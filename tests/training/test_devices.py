@@ -16,12 +16,12 @@ import hashlib
 import numpy as np
 import uavmec_jax as um
 from uavmec_jax.agents import population
-from uavmec_jax.training.partition import Blocks
+from uavmec_jax.training.partition import Partition
 from uavmec_jax.studies.study import make_agents, make_algorithm, validation_keys
 
 changes = {"axes.seeds": 2, "axes.powered": [12, 8], "axes.connected": [8, 4], "steps": 1200}
 study = um.load_study("table5", changes)
-blocks = Blocks(count=1, size=8, groups=4, bytes=0)
+blocks = Partition(count=1, size=8, groups=4, bytes=0)
 assert blocks.devices == int(sys.argv[1])
 validation = um.Validation(every=400, draws=16)
 (trained,) = population.train(

@@ -18,7 +18,7 @@ from uavmec_jax.env.rollout import rollouts
 from uavmec_jax.env.scenario import make_scenario
 from uavmec_jax.planning.heuristics import HEURISTICS
 from uavmec_jax.training import population
-from uavmec_jax.training.partition import Blocks, PopulationTooLargeError, plan_blocks
+from uavmec_jax.training.partition import Partition, PopulationTooLargeError, partition_population
 from uavmec_jax.training.programs import Best, _look
 from uavmec_jax.training.training import Validation
 
@@ -37,7 +37,7 @@ def train(agents, steps=2000, blocks=None, validation=None, **spec):
             agents,
             keys,
             validation=validation,
-            blocks=blocks or plan_blocks(n, algorithm.agent_bytes, GIB),
+            blocks=blocks or partition_population(n, algorithm.agent_bytes, GIB),
             on_progress=news.append,
         )
     )
@@ -45,11 +45,13 @@ def train(agents, steps=2000, blocks=None, validation=None, **spec):
 
 
 def test_blocks_are_equal_cover_everyone_and_fit():
-    assert plan_blocks(250, 64 * 10**6, 16 * GIB) == Blocks(count=4, size=64, groups=2, bytes=64 * 64 * 10**6)
-    assert plan_blocks(1, 10, GIB) == Blocks(count=1, size=1, groups=1, bytes=10)
+    assert partition_population(250, 64 * 10**6, 16 * GIB) == Partition(
+        count=4, size=64, groups=2, bytes=64 * 64 * 10**6
+    )
+    assert partition_population(1, 10, GIB) == Partition(count=1, size=1, groups=1, bytes=10)
     for n in (1, 2, 3, 75, 81, 1000):
         for memory in (GIB, 10 * GIB):
-            blocks = plan_blocks(n, 64 * 2**20, memory)
+            blocks = partition_population(n, 64 * 2**20, memory)
             assert blocks.count * blocks.size >= n
             assert (blocks.count - 1) * blocks.size < n
             assert blocks.bytes <= memory
@@ -57,24 +59,24 @@ def test_blocks_are_equal_cover_everyone_and_fit():
 
 
 def test_too_little_memory_is_said():
-    assert plan_blocks(10, 3 * GIB, 4 * GIB).groups == 1
+    assert partition_population(10, 3 * GIB, 4 * GIB).groups == 1
     with pytest.raises(PopulationTooLargeError, match=r"one agent needs 5.0 GiB and 4.0 GiB are free"):
-        plan_blocks(10, 5 * GIB, 4 * GIB)
+        partition_population(10, 5 * GIB, 4 * GIB)
 
 
 @pytest.mark.slow
 def test_what_a_block_leaves():
     agents = stack([make_agent(i) for i in range(3)])
     (block,), news = train(agents)
-    assert_array_equal(block.look_steps, [800, 1600, 2000])
+    assert_array_equal(block.validation_steps, [800, 1600, 2000])
     assert block.validation.shape == (3, 3)
     assert block.episode_length.shape == (3, len(block.chunk_steps)) == (3, 12)
     assert block.chunk_steps[-1] == 2000
     assert_array_equal(block.diverged_at, -1)
     assert_array_equal(block.best_score, block.validation.max(axis=1))
-    assert_array_equal(block.best_step, block.look_steps[block.validation.argmax(axis=1)])
-    assert news[-1].steps == news[-1].of_steps == 6000
-    assert 9 < news[-1].mean_length < 40
+    assert_array_equal(block.best_step, block.validation_steps[block.validation.argmax(axis=1)])
+    assert news[-1].steps == news[-1].total_steps == 6000
+    assert 9 < news[-1].mean_episode_length < 40
     assert set(block.seconds) == {"train", "validate"}
 
 
@@ -97,9 +99,9 @@ def test_best_weights_are_those_of_the_best_look():
 @pytest.mark.bits
 def test_blocks_padding_and_devices_do_not_change_an_agent():
     agents = stack([make_agent(i) for i in range(5)])
-    (whole,), _ = train(agents, 1000, blocks=Blocks(1, 6, 2, 0))
-    split, _ = train(agents, 1000, blocks=Blocks(2, 4, 2, 0))
-    single, _ = train(agents, 1000, blocks=Blocks(1, 5, 1, 0))
+    (whole,), _ = train(agents, 1000, blocks=Partition(1, 6, 2, 0))
+    split, _ = train(agents, 1000, blocks=Partition(2, 4, 2, 0))
+    single, _ = train(agents, 1000, blocks=Partition(1, 5, 1, 0))
     assert [len(block.best_step) for block in split] == [4, 1]
     pieces = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(block.last for block in split))
     for other in (pieces, single[0].last):

@@ -11,10 +11,10 @@ from jaxtyping import Array, Float
 
 from uavmec_jax.agents import on_policy
 from uavmec_jax.agents.algorithm import Agent, Algorithm
-from uavmec_jax.agents.collect_rollout import Samples, play
+from uavmec_jax.agents.collect_rollout import Samples, collect_rollout
 from uavmec_jax.agents.gae import log_probability, normalized
 from uavmec_jax.agents.on_policy import OnPolicyHyper, OnPolicySpec, OnPolicyState
-from uavmec_jax.agents.optimizers import Descent, clipped_rmsprop, descend
+from uavmec_jax.agents.optimizers import TrainState, apply_gradients, clipped_rmsprop
 
 _OPTIMIZER = clipped_rmsprop(decay=0.99, eps=1e-5)
 
@@ -26,7 +26,7 @@ class A2CHyper(OnPolicyHyper):
     learning_rate: Any = struct.field(default=7e-4, metadata={"gt": 0})
     gae_lambda: Any = struct.field(default=1.0, metadata={"ge": 0, "le": 1})
     normalize_advantage: Any = False
-    """Whether advantages are normalised within each rollout."""
+    """Whether generalized_advantages are normalised within each rollout."""
 
 
 @dataclass(frozen=True)
@@ -52,13 +52,13 @@ def a2c_loss(spec: A2CSpec, hyper: A2CHyper, weights: Any, samples: Samples) -> 
 
 
 def learn(
-    spec: A2CSpec, hyper: A2CHyper, descent: Descent, samples: Samples, steps_done: Any
-) -> tuple[Descent, Float[Array, ""]]:
+    spec: A2CSpec, hyper: A2CHyper, train_state: TrainState, samples: Samples, steps_done: Any
+) -> tuple[TrainState, Float[Array, ""]]:
     """One gradient step on a whole rollout."""
-    loss, gradient = jax.value_and_grad(lambda w: a2c_loss(spec, hyper, w, samples))(descent.weights)
-    after = descend(
+    loss, gradient = jax.value_and_grad(lambda w: a2c_loss(spec, hyper, w, samples))(train_state.weights)
+    after = apply_gradients(
         _OPTIMIZER,
-        descent,
+        train_state,
         loss,
         gradient,
         learning_rate=hyper.learning_rate,
@@ -71,5 +71,5 @@ def learn(
 
 def _iteration(spec: A2CSpec, agent: Agent, state: OnPolicyState, i: Any) -> OnPolicyState:
     """A rollout and one gradient step."""
-    state, samples = play(spec, agent, state, jax.random.fold_in(agent.key, i))
-    return state.after(*learn(spec, agent.hyper, state.descent, samples, (i + 1) * spec.steps_per_iteration))
+    state, samples = collect_rollout(spec, agent, state, jax.random.fold_in(agent.key, i))
+    return state.after(*learn(spec, agent.hyper, state.train_state, samples, (i + 1) * spec.steps_per_iteration))

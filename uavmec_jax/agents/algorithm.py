@@ -7,7 +7,7 @@ from typing import Any, Protocol
 from flax import struct
 from jaxtyping import Array
 
-from uavmec_jax.agents.observation_spec import PERCEPTIONS
+from uavmec_jax.agents.observation_spec import OBSERVATIONS
 from uavmec_jax.env.dynamics import State
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
@@ -53,10 +53,10 @@ class Algorithm:
         init: ``(agent) -> state``.
         update: ``(agent, state, first, last) -> state``: the iterations ``first <= i < last``; the two bounds are
             shared by all agents and never batched. Runs under ``vmap(axis_name=AGENTS_AXIS)``.
-        greedy: ``(hyper, weights, observation [..., words]) -> action [...]`` int32, the best one in the eyes of the weights.
-        see: ``(params, layout, state) -> observation [..., words]``; by default the paper's.
-        critic: ``(hyper, weights, observation [B, words]) -> [B]``, what the rest of an episode is worth; ``None`` where
-            there is no critic.
+        greedy: ``(hyper, weights, observation [..., obs_size]) -> action [...]`` int32, the best one in the eyes of the weights.
+        observation_fn: ``(params, layout, state) -> observation [..., obs_size]``; by default the paper's.
+        value_fn: ``(hyper, weights, observation [B, obs_size]) -> [B]``, what the rest of an episode is worth; ``None`` where
+            there is no value_fn.
     """
 
     name: str
@@ -66,14 +66,14 @@ class Algorithm:
     init: Callable[[Agent], Any]
     update: Callable[[Agent, Any, Any, Any], Any]
     greedy: Callable[[Any, Any, Array], Array]
-    see: Callable[[Params, Layout, State], Array] = PERCEPTIONS["paper"].see
-    critic: Callable[[Any, Any, Array], Array] | None = None
+    observation_fn: Callable[[Params, Layout, State], Array] = OBSERVATIONS["paper"].observation_fn
+    value_fn: Callable[[Any, Any, Array], Array] | None = None
 
     def policy(self, hyper: Any, weights: Any) -> Policy:
         """The greedy policy of an agent; ties go to the lowest number. States may be batched."""
 
         def act(params: Params, layout: Layout, state: State, key: Any = None) -> Array:
-            return self.greedy(hyper, weights, self.see(params, layout, state))
+            return self.greedy(hyper, weights, self.observation_fn(params, layout, state))
 
         return act
 

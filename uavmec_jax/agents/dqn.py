@@ -17,11 +17,11 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, UInt
 
 from uavmec_jax.agents import replay
 from uavmec_jax.agents.algorithm import AGENTS_AXIS, Agent, Algorithm
-from uavmec_jax.agents.networks import QNetwork, n_weights, scale_ages
-from uavmec_jax.agents.optimizers import Descent, clipped_adam, descend
+from uavmec_jax.agents.networks import QNetwork, count_weights, scale_ages
+from uavmec_jax.agents.optimizers import TrainState, apply_gradients, clipped_adam
 from uavmec_jax.env.dynamics import Cause, State, initial_state
 from uavmec_jax.env.observation import observe
-from uavmec_jax.env.scenario import advance, draw_volumes, is_truncated, restart_if
+from uavmec_jax.env.scenario import advance, auto_reset, draw_volumes, is_truncated
 
 _WEIGHTS_STREAM = 2**32 - 1
 """``fold_in`` number of the initial weights; the iterations use their own numbers, from 0."""
@@ -54,7 +54,7 @@ class DQNSpec:
 
     total_steps: int = 1_000_000
     """Environment steps of one agent; rounded up to whole iterations."""
-    hidden: tuple[int, ...] = (64, 64)
+    hidden: tuple[int, ...] = field(default=(64, 64), metadata={"items": {"ge": 1, "le": 4096}})
     batch_size: int = field(default=16, metadata={"ge": 1})
     train_frequency: int = field(default=4, metadata={"ge": 1, "le": 64})
     """Environment steps per gradient step."""
@@ -62,7 +62,7 @@ class DQNSpec:
     double: bool = False
     """The online network chooses the next action, the target network judges it (van Hasselt et al., 2016)."""
     dueling: bool = False
-    """State value and advantages instead of Q-values (Wang et al., 2016)."""
+    """State value and generalized_advantages instead of Q-values (Wang et al., 2016)."""
     n_step: int = field(default=1, metadata={"ge": 1, "le": 64})
     """Rewards summed before the bootstrap (Sutton, 1988)."""
     n_devices: int = 12
@@ -74,7 +74,7 @@ class DQNSpec:
         return -(-self.total_steps // self.train_frequency)
 
     @property
-    def words(self) -> int:
+    def obs_size(self) -> int:
         """Numbers in one observation."""
         return 2 * self.n_devices
 
@@ -98,8 +98,8 @@ class DQNSpec:
 
     @property
     def agent_bytes(self) -> int:
-        """Memory of one agent in training, bytes: replay, weights, target, moments, gradient, best weights."""
-        return self.replay.bytes + 6 * 4 * n_weights(self.network, self.words)
+        """Memory of one agent in training, bytes: replay, weights, target, opt_state, gradient, best weights."""
+        return self.replay.bytes + 6 * 4 * count_weights(self.network, self.obs_size)
 
 
 @struct.dataclass
@@ -109,9 +109,9 @@ class DQNState:
     Attributes:
         weights: of the Q-network.
         target: of the target network.
-        moments: Adam's, ``optax.ScaleByAdamState``.
-        world: state of the environment.
-        rows: replay memory, ``[rows, words]`` uint32.
+        opt_state: Adam's, ``optax.ScaleByAdamState``.
+        env_state: state of the environment.
+        rows: replay memory, ``[rows, obs_size]`` uint32.
         diverged_at: int32, environment step at which the agent was frozen, -1 while it is sound.
         episode_slots: int32, total length of the episodes that ended in this call of ``update``.
         episodes: int32, how many those were.
@@ -120,8 +120,8 @@ class DQNState:
 
     weights: Any
     target: Any
-    moments: Any
-    world: State
+    opt_state: Any
+    env_state: State
     rows: Any
     diverged_at: Any
     episode_slots: Any
@@ -149,8 +149,8 @@ def init(spec: DQNSpec, agent: Agent) -> DQNState:
     return DQNState(
         weights=weights,
         target=jax.tree.map(jnp.copy, weights),
-        moments=clipped_adam().init(weights),
-        world=initial_state(agent.scenario.params, agent.scenario.layout),
+        opt_state=clipped_adam().init(weights),
+        env_state=initial_state(agent.scenario.params, agent.scenario.layout),
         rows=replay.init(spec.replay),
         diverged_at=jnp.int32(-1),
         episode_slots=jnp.int32(0),
@@ -185,7 +185,7 @@ def target_is_due(spec: DQNSpec, hyper: DQNHyper, steps_done: Any) -> Bool[Array
     return steps_done // hyper.target_interval > (steps_done - spec.train_frequency) // hyper.target_interval
 
 
-def mix_if(due: Bool[ArrayLike, ""], tau: Any, weights: Any, target: Any) -> Any:
+def update_target(due: Bool[ArrayLike, ""], tau: Any, weights: Any, target: Any) -> Any:
     """The target network after an update, if one is due; with ``tau`` 1 it is the weights to the bit."""
     return jax.tree.map(lambda new, old: jnp.where(due, tau * new + (1.0 - tau) * old, old), weights, target)
 
@@ -208,10 +208,10 @@ def td_loss(spec: DQNSpec, hyper: DQNHyper, weights: Any, target: Any, batch: re
     if spec.double:
         chosen_next = jnp.argmax(q_values(spec, hyper, weights, batch.next_observation), axis=-1)
         best_next = jnp.sum(next_values * jax.nn.one_hot(chosen_next, spec.n_devices), axis=-1)
-    goal = batch.reward + (1.0 - batch.terminated) * batch.discount * best_next
+    td_target = batch.reward + (1.0 - batch.terminated) * batch.discount * best_next
     chosen = jax.nn.one_hot(batch.action, spec.n_devices)
     value = jnp.sum(q_values(spec, hyper, weights, batch.observation) * chosen, axis=-1)
-    return jnp.mean(optax.huber_loss(value, goal))
+    return jnp.mean(optax.huber_loss(value, td_target))
 
 
 def _iteration(spec: DQNSpec, agent: Agent, state: DQNState, i: Int[Array, ""]) -> DQNState:
@@ -235,7 +235,7 @@ def _iteration(spec: DQNSpec, agent: Agent, state: DQNState, i: Int[Array, ""]) 
     due = target_is_due(spec, agent.hyper, steps_done)
     target = jax.lax.cond(  # a true branch: the predicate is the same for all agents
         jax.lax.pmax(due, AGENTS_AXIS),
-        lambda: mix_if(due, agent.hyper.tau, state.weights, state.target),
+        lambda: update_target(due, agent.hyper.tau, state.weights, state.target),
         lambda: state.target,
     )
     batch = replay.sample(spec.replay, rows, steps_done, bits[n_acting:], agent.hyper.gamma)
@@ -244,23 +244,23 @@ def _iteration(spec: DQNSpec, agent: Agent, state: DQNState, i: Int[Array, ""]) 
 
 def _act(
     spec: DQNSpec, agent: Agent, state: DQNState, steps_done: Any, uniform: Float[Array, " n_plus_2"]
-) -> tuple[DQNState, UInt[Array, " words"]]:
+) -> tuple[DQNState, UInt[Array, " obs_size"]]:
     """One epsilon-greedy environment step and the row to remember it by."""
     n = spec.n_devices
     scenario, layout = agent.scenario, agent.scenario.layout
-    best = greedy(spec, agent.hyper, state.weights, observe(layout, state.world))
+    best = greedy(spec, agent.hyper, state.weights, observe(layout, state.env_state))
     anywhere = jnp.minimum((uniform[n + 1] * n).astype(jnp.int32), n - 1)
     warm_up = steps_done < agent.hyper.learning_starts
     explore = warm_up | (uniform[n] < epsilon(agent.hyper, spec.total_steps, steps_done))
     action = jnp.where(explore, anywhere, best)
 
-    after, reward, outcome = advance(scenario, state.world, action, draw_volumes(scenario.params, uniform[:n]))
+    after, reward, outcome = advance(scenario, state.env_state, action, draw_volumes(scenario.params, uniform[:n]))
     terminated = outcome.cause != Cause.NONE
     ended = terminated | is_truncated(scenario, after, outcome)
     row = replay.pack(spec.replay, action, reward, after.battery / layout.capacity, after.age, terminated, ended)
     state = replace(
         state,
-        world=restart_if(ended, scenario, after),
+        env_state=auto_reset(ended, scenario, after),
         episode_slots=state.episode_slots + jnp.where(ended, after.slot, 0),
         episodes=state.episodes + ended,
     )
@@ -270,9 +270,9 @@ def _act(
 def _learn(spec: DQNSpec, hyper: DQNHyper, state: DQNState, batch: replay.Transition, steps_done: Any) -> DQNState:
     """One gradient step, unless the agent is still warming up or has diverged."""
     loss, gradient = jax.value_and_grad(lambda w: td_loss(spec, hyper, w, state.target, batch))(state.weights)
-    after = descend(
+    after = apply_gradients(
         clipped_adam(),
-        Descent(state.weights, state.moments, state.diverged_at),
+        TrainState(state.weights, state.opt_state, state.diverged_at),
         loss,
         gradient,
         learning_rate=hyper.learning_rate,
@@ -281,4 +281,4 @@ def _learn(spec: DQNSpec, hyper: DQNHyper, state: DQNState, batch: replay.Transi
         steps_done=steps_done,
         learning=steps_done > hyper.learning_starts,
     )
-    return replace(state, weights=after.weights, moments=after.moments, diverged_at=after.diverged_at, loss=loss)
+    return replace(state, weights=after.weights, opt_state=after.opt_state, diverged_at=after.diverged_at, loss=loss)

@@ -1,4 +1,4 @@
-"""Estimates that policy gradients are made of: drawn actions, their log-probabilities, generalised advantages."""
+"""Estimates that policy gradients are made of: drawn actions, their log-probabilities, generalised generalized_advantages."""
 
 from typing import Any
 
@@ -7,14 +7,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 
-def choose(scores: Float[Array, "e n"], uniform: Float[Array, " e"]) -> Int[Array, " e"]:
+def sample_action(scores: Float[Array, "e n"], uniform: Float[Array, " e"]) -> Int[Array, " e"]:
     """Actions ``[E]`` drawn from the softmax of ``scores``, each by one uniform number in [0, 1)."""
     mass = jnp.cumsum(jnp.exp(scores - jnp.max(scores, axis=-1, keepdims=True)), axis=-1)
     below = jnp.sum(mass <= uniform[:, None] * mass[:, -1:], axis=-1)
     return jnp.minimum(below, scores.shape[-1] - 1).astype(jnp.int32)
 
 
-def advantages(
+def generalized_advantages(
     reward: Float[Array, "t e"],
     value: Float[Array, "t e"],
     last_value: Float[Array, " e"],

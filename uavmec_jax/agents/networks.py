@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from uavmec_jax.env.fixed_point import sum_in_any_order
+from uavmec_jax.env.fixed_point import order_independent_sum
 
 
 @jax.custom_vjp
@@ -91,7 +91,7 @@ class QNetwork(nn.Module):
     Attributes:
         n_actions: number of actions, one per device.
         hidden: widths of the hidden layers; (64, 64) in the paper.
-        dueling: whether the head is a state value and advantages of mean zero (Wang et al., 2016, equation 9).
+        dueling: whether the head is a state value and generalized_advantages of mean zero (Wang et al., 2016, equation 9).
     """
 
     n_actions: int
@@ -154,7 +154,7 @@ class ActorCritic(nn.Module):
         return self.logits(observation), self.value(observation)
 
 
-def n_weights(network: nn.Module, observation_size: int) -> int:
+def count_weights(network: nn.Module, observation_size: int) -> int:
     """Number of weights of a network, without making them."""
     made: Any = jax.eval_shape(network.init, jax.random.key(0), jnp.zeros((1, observation_size)))
     return sum(leaf.size for leaf in jax.tree.leaves(made))
@@ -168,8 +168,8 @@ def scale_ages(observation: Float[Array, "*b two_n"], age_scale: Any) -> Float[A
 
 @jax.custom_jvp
 def sum_over_devices(x: Float[Array, "b n f"]) -> Float[Array, "b f"]:
-    """:func:`sum_in_any_order` over the devices, with the gradient of a plain sum."""
-    return sum_in_any_order(x, axis=-2)
+    """:func:`order_independent_sum` over the devices, with the gradient of a plain sum."""
+    return order_independent_sum(x, axis=-2)
 
 
 @sum_over_devices.defjvp
@@ -177,7 +177,7 @@ def _sum_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Arra
     return sum_over_devices(*primals), jnp.sum(tangents[0], axis=-2)
 
 
-class Score(nn.Module):
+class RowScore(nn.Module):
     """One number for each row, orthogonal weights times ``gain``, the bits of which do not depend on the row's place.
 
     A matrix product with one column has other bits in the last rows of a batch than in the first (XLA's CPU kernels); a
@@ -194,14 +194,15 @@ class Score(nn.Module):
 
 
 class EquivariantActorCritic(nn.Module):
-    """An actor and a critic for any number of devices: permuting the devices permutes the logits, and nothing else.
+    """An actor and a critic for any number of devices; permuting the devices permutes the logits to the bit.
 
-    One small network looks at every device by itself; means and maxima over the devices tell a second one, again for
-    every device by itself, about the others (Zaheer et al., 2017, Deep sets, theorem 2 and section 4).
+    An encoder looks at every device by itself; means and maxima over the devices tell the policy head, again for every
+    device by itself, about the others (Zaheer et al., 2017, Deep sets, theorem 2 and section 4). The names of the layers are
+    those of the published weights, and seed the initial ones.
 
     Attributes:
         n_features: features of a device; the rows of an observation hold its mask behind them.
-        hidden: width of the layer that looks at a device, and of the one that knows about the others.
+        hidden: widths of the encoder's layers; the last one is that of the heads, too.
     """
 
     n_features: int
@@ -209,47 +210,47 @@ class EquivariantActorCritic(nn.Module):
 
     def setup(self) -> None:
         """Declare the layers."""
-        gain = math.sqrt(2.0)
-        self.looks = [OrthogonalDense(width, gain) for width in self.hidden]
-        self.others = OrthogonalDense(self.hidden[-1], gain)
-        self.own = OrthogonalDense(self.hidden[-1], gain)
-        self.score = Score(0.01)
-        self.appraise = OrthogonalDense(self.hidden[-1], gain)
-        self.worth = Score(1.0)
+        gain, width = math.sqrt(2.0), self.hidden[-1]
+        self.encoder = [OrthogonalDense(size, gain, name=f"looks_{k}") for k, size in enumerate(self.hidden)]
+        self.policy_own = OrthogonalDense(width, gain, name="own")
+        self.policy_pooled = OrthogonalDense(width, gain, name="others")
+        self.policy_head = RowScore(0.01, name="score")
+        self.value_hidden = OrthogonalDense(width, gain, name="appraise")
+        self.value_head = RowScore(1.0, name="worth")
 
-    def _pooled(self, observation: Float[Array, "b words"]) -> tuple[Array, Array, Array]:
-        """Every device by itself ``[B, n, h]``, all of them ``[B, 2h]``, and the mask ``[B, n]``."""
+    def _encode(self, observation: Float[Array, "B obs_size"]) -> tuple[Array, Array, Array]:
+        """Embed every device ``[B, n, h]``, pool them ``[B, 2h]``, and return the mask ``[B, n]``."""
         devices = observation.reshape(observation.shape[0], -1, self.n_features + 1)
         mask = devices[..., -1] > 0.5
         x = devices[..., :-1].reshape(-1, self.n_features)
-        for layer in self.looks:
+        for layer in self.encoder:
             x = nn.relu(layer(x))
         x = x.reshape(*mask.shape, -1)
-        shown = jnp.where(mask[..., None], x, 0.0)  # what relu leaves is not negative, so 0 never wins over a device
+        present = jnp.where(mask[..., None], x, 0.0)  # relu leaves nothing below 0, so padding never is the maximum
         count = jnp.maximum(jnp.sum(mask, axis=-1, keepdims=True), 1)
-        return x, jnp.concatenate([sum_over_devices(shown) / count, jnp.max(shown, axis=-2)], axis=-1), mask
+        return x, jnp.concatenate([sum_over_devices(present) / count, jnp.max(present, axis=-2)], axis=-1), mask
 
-    def _logits(self, x: Array, pooled: Array, mask: Array) -> Float[Array, "b n"]:
-        own = self.own(x.reshape(-1, x.shape[-1])).reshape(x.shape)
-        x = nn.relu(own + self.others(pooled)[:, None])
-        return jnp.where(mask, self.score(x), NOT_THERE)
+    def _logits(self, x: Array, pooled: Array, mask: Array) -> Float[Array, "B n"]:
+        own = self.policy_own(x.reshape(-1, x.shape[-1])).reshape(x.shape)
+        x = nn.relu(own + self.policy_pooled(pooled)[:, None])
+        return jnp.where(mask, self.policy_head(x), ABSENT_LOGIT)
 
-    def _value(self, pooled: Array) -> Float[Array, " b"]:
-        return self.worth(nn.relu(self.appraise(pooled)))
+    def _value(self, pooled: Array) -> Float[Array, " B"]:
+        return self.value_head(nn.relu(self.value_hidden(pooled)))
 
-    def logits(self, observation: Float[Array, "b words"]) -> Float[Array, "b n"]:
-        """Unnormalised log-probabilities ``[B, n]`` of the actions; :data:`NOT_THERE` where there is no device."""
-        return self._logits(*self._pooled(observation))
+    def logits(self, observation: Float[Array, "B obs_size"]) -> Float[Array, "B n"]:
+        """Unnormalised log-probabilities of the actions; :data:`ABSENT_LOGIT` where there is no device."""
+        return self._logits(*self._encode(observation))
 
-    def value(self, observation: Float[Array, "b words"]) -> Float[Array, " b"]:
-        """State values ``[B]``."""
-        return self._value(self._pooled(observation)[1])
+    def value(self, observation: Float[Array, "B obs_size"]) -> Float[Array, " B"]:
+        """State values."""
+        return self._value(self._encode(observation)[1])
 
-    def __call__(self, observation: Float[Array, "b words"]) -> tuple[Array, Array]:
+    def __call__(self, observation: Float[Array, "B obs_size"]) -> tuple[Array, Array]:
         """Logits and values."""
-        x, pooled, mask = self._pooled(observation)
+        x, pooled, mask = self._encode(observation)
         return self._logits(x, pooled, mask), self._value(pooled)
 
 
-NOT_THERE = -1e9
+ABSENT_LOGIT = -1e9
 """Logit of an action that is no device."""

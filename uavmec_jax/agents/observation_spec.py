@@ -20,17 +20,17 @@ from uavmec_jax.planning.observation import FEATURES, observe_devices
 
 
 @dataclass(frozen=True)
-class Perception:
-    """One way to see.
+class ObservationSpec:
+    """One way to observation_fn.
 
     Attributes:
-        see: ``(params, layout, state) -> [..., words]`` f32; states may have batch axes in front.
-        words: ``(n_devices) -> words``.
-        network: ``(n_devices, hidden) -> actor and critic`` on batches ``[B, words]``.
+        observation_fn: ``(params, layout, state) -> [..., obs_size]`` f32; states may have batch axes in front.
+        obs_size: ``(n_devices) -> obs_size``.
+        network: ``(n_devices, hidden) -> actor and critic`` on batches ``[B, obs_size]``.
     """
 
-    see: Callable[[Params, Layout, State], Array]
-    words: Callable[[int], int]
+    observation_fn: Callable[[Params, Layout, State], Array]
+    obs_size: Callable[[int], int]
     network: Callable[[int, tuple[int, ...]], nn.Module]
 
 
@@ -46,10 +46,10 @@ def _equivariant(n_devices: int, hidden: tuple[int, ...]) -> Any:
     return EquivariantActorCritic(n_features=len(FEATURES), hidden=hidden)
 
 
-PERCEPTIONS: Mapping[str, Perception] = MappingProxyType(
+OBSERVATIONS: Mapping[str, ObservationSpec] = MappingProxyType(
     {
-        "paper": Perception(observe_as_paper, lambda n: 2 * n, ActorCritic),
-        "full": Perception(_see_all, lambda n: n * (len(FEATURES) + 1), _equivariant),
+        "paper": ObservationSpec(observe_as_paper, lambda n: 2 * n, ActorCritic),
+        "full": ObservationSpec(_see_all, lambda n: n * (len(FEATURES) + 1), _equivariant),
     }
 )
 """Name, as in study files -> what is seen."""

@@ -1,4 +1,4 @@
-"""What PPO and A2C share: an actor, a critic and their weights.
+"""What PPO and A2C share: an actor, a value_fn and their weights.
 
 One iteration plays ``n_steps`` slots in each of ``n_envs`` environments of an agent (:mod:`uavmec_jax.agents.collect_rollout`)
 and then learns from them; how, is all that the two differ in (:mod:`uavmec_jax.agents.ppo`,
@@ -17,14 +17,14 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from uavmec_jax.agents.algorithm import Agent, Algorithm
-from uavmec_jax.agents.networks import n_weights, scale_ages
-from uavmec_jax.agents.observation_spec import PERCEPTIONS, Perception
-from uavmec_jax.agents.optimizers import Descent
+from uavmec_jax.agents.networks import count_weights, scale_ages
+from uavmec_jax.agents.observation_spec import OBSERVATIONS, ObservationSpec
+from uavmec_jax.agents.optimizers import TrainState
 from uavmec_jax.env.dynamics import State, initial_state
 from uavmec_jax.env.generator import ScenarioDistribution, sample_scenario
 from uavmec_jax.env.scenario import Scenario
 
-_WEIGHTS_STREAM, _WORLDS_STREAM = 2**32 - 1, 2**32 - 2
+_WEIGHTS_STREAM, _SCENARIOS_STREAM = 2**32 - 1, 2**32 - 2
 """``fold_in`` numbers of the initial weights and scenarios; the iterations use their own numbers, from 0."""
 
 
@@ -39,9 +39,9 @@ class OnPolicyHyper:
     vf_coef: Any = struct.field(default=0.5, metadata={"ge": 0})
     max_grad_norm: Any = struct.field(default=0.5, metadata={"gt": 0})
     normalize_advantage: Any = True
-    """Whether advantages are normalised within each minibatch."""
+    """Whether generalized_advantages are normalised within each minibatch."""
     age_scale: Any = struct.field(default=1.0, metadata={"gt": 0})
-    """Factor on the ages as the networks see them in the paper's observation; 1 in the paper."""
+    """Factor on the ages as the networks observation_fn them in the paper's observation; 1 in the paper."""
 
 
 @dataclass(frozen=True)
@@ -50,9 +50,9 @@ class OnPolicySpec:
 
     total_steps: int = 1_000_000
     """Environment steps of one agent; rounded up to whole iterations."""
-    hidden: tuple[int, ...] = (64, 64)
-    observation: str = field(default="paper", metadata={"choices": tuple(PERCEPTIONS)})
-    """What the networks see: ``paper``, batteries and ages, or ``full``, for which they are permutation-equivariant."""
+    hidden: tuple[int, ...] = field(default=(64, 64), metadata={"items": {"ge": 1, "le": 4096}})
+    observation: str = field(default="paper", metadata={"choices": tuple(OBSERVATIONS)})
+    """What the networks observation_fn: ``paper``, batteries and ages, or ``full``, for which they are permutation-equivariant."""
     n_envs: int = field(default=1, metadata={"ge": 1, "le": 4096})
     """Environments of one agent."""
     n_steps: int = field(default=2048, metadata={"ge": 1, "le": 1_000_000})
@@ -70,25 +70,25 @@ class OnPolicySpec:
         return -(-self.total_steps // self.steps_per_iteration)
 
     @property
-    def perception(self) -> Perception:
-        """What the networks see."""
-        return PERCEPTIONS[self.observation]
+    def observation_spec(self) -> ObservationSpec:
+        """What the networks observation_fn."""
+        return OBSERVATIONS[self.observation]
 
     @property
-    def words(self) -> int:
+    def obs_size(self) -> int:
         """Numbers in one observation."""
-        return self.perception.words(self.n_devices)
+        return self.observation_spec.obs_size(self.n_devices)
 
     @property
     def network(self) -> Any:
         """Policy and value networks."""
-        return self.perception.network(self.n_devices, self.hidden)
+        return self.observation_spec.network(self.n_devices, self.hidden)
 
     @property
     def agent_bytes(self) -> int:
-        """Memory of one agent in training, bytes: a rollout and its shuffled copy, weights, moments, gradient, best."""
-        rollout = self.steps_per_iteration * (2 * (self.words + 4) + self.n_devices + 1)
-        return 4 * (rollout + 6 * n_weights(self.network, self.words))
+        """Memory of one agent in training, bytes: a rollout and its shuffled copy, weights, opt_state, gradient, best."""
+        rollout = self.steps_per_iteration * (2 * (self.obs_size + 4) + self.n_devices + 1)
+        return 4 * (rollout + 6 * count_weights(self.network, self.obs_size))
 
 
 @struct.dataclass
@@ -97,8 +97,8 @@ class OnPolicyState:
 
     Attributes:
         weights: of the two networks.
-        moments: the optimiser's.
-        worlds: states of the environments, leaves ``[n_envs, ...]``.
+        opt_state: the optimiser's.
+        env_states: states of the environments, leaves ``[n_envs, ...]``.
         scenarios: what each environment plays, leaves ``[n_envs, ...]``; ``None`` where it is the agent's scenario.
         diverged_at: int32, environment step at which the agent was frozen, -1 while it is sound.
         episode_slots: int32, total length of the episodes that ended in this call of ``update``.
@@ -107,8 +107,8 @@ class OnPolicyState:
     """
 
     weights: Any
-    moments: Any
-    worlds: State
+    opt_state: Any
+    env_states: State
     diverged_at: Any
     episode_slots: Any
     episodes: Any
@@ -116,14 +116,18 @@ class OnPolicyState:
     scenarios: Scenario | None = None
 
     @property
-    def descent(self) -> Descent:
+    def train_state(self) -> TrainState:
         """What a gradient step moves."""
-        return Descent(self.weights, self.moments, self.diverged_at)
+        return TrainState(self.weights, self.opt_state, self.diverged_at)
 
-    def after(self, descent: Descent, loss: Float[Array, ""]) -> "OnPolicyState":
+    def after(self, train_state: TrainState, loss: Float[Array, ""]) -> "OnPolicyState":
         """The state after gradient steps."""
         return replace(
-            self, weights=descent.weights, moments=descent.moments, diverged_at=descent.diverged_at, loss=loss
+            self,
+            weights=train_state.weights,
+            opt_state=train_state.opt_state,
+            diverged_at=train_state.diverged_at,
+            loss=loss,
         )
 
 
@@ -142,26 +146,26 @@ def bind(
         init=partial(init, spec, optimizer),
         update=partial(_update, iteration),
         greedy=partial(greedy, spec),
-        see=spec.perception.see,
-        critic=partial(value, spec),
+        observation_fn=spec.observation_spec.observation_fn,
+        value_fn=partial(value, spec),
     )
 
 
 def init(spec: OnPolicySpec, optimizer: optax.GradientTransformationExtraArgs, agent: Agent) -> OnPolicyState:
     """A fresh agent: orthogonal weights, a new episode in every environment."""
-    weights = spec.network.init(jax.random.fold_in(agent.key, _WEIGHTS_STREAM), jnp.zeros((1, spec.words)))
+    weights = spec.network.init(jax.random.fold_in(agent.key, _WEIGHTS_STREAM), jnp.zeros((1, spec.obs_size)))
     scenarios = None
     if isinstance(agent.scenario, ScenarioDistribution):
-        keys = jax.random.split(jax.random.fold_in(agent.key, _WORLDS_STREAM), spec.n_envs)
+        keys = jax.random.split(jax.random.fold_in(agent.key, _SCENARIOS_STREAM), spec.n_envs)
         scenarios = jax.vmap(partial(sample_scenario, agent.scenario))(keys)
-        worlds = jax.vmap(initial_state)(scenarios.params, scenarios.layout)
+        env_states = jax.vmap(initial_state)(scenarios.params, scenarios.layout)
     else:
-        world = initial_state(agent.scenario.params, agent.scenario.layout)
-        worlds = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (spec.n_envs, *jnp.shape(leaf))), world)
+        env_state = initial_state(agent.scenario.params, agent.scenario.layout)
+        env_states = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (spec.n_envs, *jnp.shape(leaf))), env_state)
     return OnPolicyState(
         weights=weights,
-        moments=optimizer.init(weights),
-        worlds=worlds,
+        opt_state=optimizer.init(weights),
+        env_states=env_states,
         diverged_at=jnp.int32(-1),
         episode_slots=jnp.int32(0),
         episodes=jnp.int32(0),
@@ -190,25 +194,27 @@ def greedy(
     return jnp.argmax(scores, axis=-1).astype(jnp.int32).reshape(observation.shape[:-1])
 
 
-def _seen(spec: OnPolicySpec, hyper: OnPolicyHyper, observation: Float[Array, "b words"]) -> Float[Array, "b words"]:
+def _seen(
+    spec: OnPolicySpec, hyper: OnPolicyHyper, observation: Float[Array, "b obs_size"]
+) -> Float[Array, "b obs_size"]:
     """Observations as the networks take them: the paper's with its ages scaled."""
     return scale_ages(observation, hyper.age_scale) if spec.observation == "paper" else observation
 
 
-def logits(spec: OnPolicySpec, hyper: OnPolicyHyper, weights: Any, observation: Float[Array, "b words"]) -> Array:
+def logits(spec: OnPolicySpec, hyper: OnPolicyHyper, weights: Any, observation: Float[Array, "b obs_size"]) -> Array:
     """Unnormalised log-probabilities ``[B, n]``."""
     scores: Any = spec.network.apply(weights, _seen(spec, hyper, observation), method="logits")
     return scores
 
 
-def value(spec: OnPolicySpec, hyper: OnPolicyHyper, weights: Any, observation: Float[Array, "b words"]) -> Array:
+def value(spec: OnPolicySpec, hyper: OnPolicyHyper, weights: Any, observation: Float[Array, "b obs_size"]) -> Array:
     """State values ``[B]``."""
     worth: Any = spec.network.apply(weights, _seen(spec, hyper, observation), method="value")
     return worth
 
 
 def both(
-    spec: OnPolicySpec, hyper: OnPolicyHyper, weights: Any, observation: Float[Array, "b words"]
+    spec: OnPolicySpec, hyper: OnPolicyHyper, weights: Any, observation: Float[Array, "b obs_size"]
 ) -> tuple[Array, Array]:
     """:func:`logits` and :func:`value` in one pass through what the two networks share."""
     found: Any = spec.network.apply(weights, _seen(spec, hyper, observation))

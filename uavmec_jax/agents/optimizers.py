@@ -56,7 +56,7 @@ def clipped_adam(eps: float = 1e-8) -> optax.GradientTransformationExtraArgs:
         gradients = _clipped(updates, norm, max_norm, enabled)
         mu = jax.tree.map(lambda m, g: _B1 * m + (1 - _B1) * g, state.mu, gradients)
         nu = jax.tree.map(lambda v, g: _B2 * v + (1 - _B2) * g * g, state.nu, gradients)
-        # Without the barrier XLA computes both moments a second time inside the weights' loop, and copies the old ones.
+        # Without the barrier XLA computes both opt_state a second time inside the weights' loop, and copies the old ones.
         mu, nu = jax.lax.optimization_barrier((mu, nu))
         updates_made = jnp.maximum(count, 1).astype(jnp.float32)
         # 1 - b**t as -expm1(t log b): in 32 bits the plain difference is off by 1e-5 for the first updates.
@@ -100,23 +100,23 @@ def clipped_rmsprop(decay: float = 0.99, eps: float = 1e-5) -> optax.GradientTra
 
 
 @struct.dataclass
-class Descent:
+class TrainState:
     """The part of a learner's state that a gradient step moves.
 
     Attributes:
         weights: of the network.
-        moments: the optimiser's state.
+        opt_state: the optimiser's state.
         diverged_at: int32, environment step at which the agent was frozen, -1 while it is sound.
     """
 
     weights: Any
-    moments: Any
+    opt_state: Any
     diverged_at: Any
 
 
-def descend(
+def apply_gradients(
     optimizer: optax.GradientTransformationExtraArgs,
-    descent: Descent,
+    train_state: TrainState,
     loss: Float[Array, ""],
     gradient: Any,
     *,
@@ -125,7 +125,7 @@ def descend(
     count: Any,
     steps_done: Any,
     learning: Any = True,
-) -> Descent:
+) -> TrainState:
     """One gradient step, unless the agent is not ``learning`` yet or has diverged.
 
     A loss or gradient that is not finite, or a learning rate beyond :data:`MAX_LEARNING_RATE`, freezes the agent with
@@ -133,18 +133,18 @@ def descend(
     """
     norm = global_norm(gradient)
     sound = jnp.isfinite(loss) & jnp.isfinite(norm) & (jnp.abs(learning_rate) <= MAX_LEARNING_RATE)
-    frozen = (descent.diverged_at >= 0) | (learning & ~sound)
-    steps, moments = optimizer.update(
+    frozen = (train_state.diverged_at >= 0) | (learning & ~sound)
+    steps, opt_state = optimizer.update(
         gradient,
-        descent.moments,
+        train_state.opt_state,
         learning_rate=learning_rate,
         max_norm=max_norm,
         norm=norm,
         count=count,
         enabled=learning & ~frozen,
     )
-    return Descent(
-        weights=optax.apply_updates(descent.weights, steps),
-        moments=moments,
-        diverged_at=jnp.where(frozen & (descent.diverged_at < 0), steps_done, descent.diverged_at),
+    return TrainState(
+        weights=optax.apply_updates(train_state.weights, steps),
+        opt_state=opt_state,
+        diverged_at=jnp.where(frozen & (train_state.diverged_at < 0), steps_done, train_state.diverged_at),
     )

@@ -11,10 +11,10 @@ from jaxtyping import Array, Float
 
 from uavmec_jax.agents import on_policy
 from uavmec_jax.agents.algorithm import Agent, Algorithm
-from uavmec_jax.agents.collect_rollout import Samples, play
+from uavmec_jax.agents.collect_rollout import Samples, collect_rollout
 from uavmec_jax.agents.gae import log_probability, normalized
 from uavmec_jax.agents.on_policy import OnPolicyHyper, OnPolicySpec, OnPolicyState
-from uavmec_jax.agents.optimizers import Descent, clipped_adam, descend
+from uavmec_jax.agents.optimizers import TrainState, apply_gradients, clipped_adam
 
 _OPTIMIZER = clipped_adam(eps=1e-5)
 
@@ -72,34 +72,39 @@ def ppo_loss(spec: PPOSpec, hyper: PPOHyper, weights: Any, batch: Samples) -> Fl
 def _iteration(spec: PPOSpec, agent: Agent, state: OnPolicyState, i: Any) -> OnPolicyState:
     """A rollout, then ``n_epochs`` passes over it in fresh random orders."""
     play_key, *epoch_keys = jax.random.split(jax.random.fold_in(agent.key, i), 1 + spec.n_epochs)
-    state, samples = play(spec, agent, state, play_key)
+    state, samples = collect_rollout(spec, agent, state, play_key)
     updates_done = i * spec.n_epochs * spec.minibatches
     steps_done = (i + 1) * spec.steps_per_iteration
     rows = _rows(samples)
     decay = agent.hyper.learning_rate_decay ** (i / spec.iterations)
     hyper = replace(agent.hyper, learning_rate=agent.hyper.learning_rate * decay)
 
-    def epoch(carry: tuple[Descent, Array], numbered: tuple[Any, Any]) -> tuple[tuple[Descent, Array], None]:
+    def epoch(carry: tuple[TrainState, Array], numbered: tuple[Any, Any]) -> tuple[tuple[TrainState, Array], None]:
         number, key = numbered
         shuffled = rows[_permutation(key, rows.shape[0])]
         count = updates_done + number * spec.minibatches + 1
         return learn(spec, hyper, carry[0], shuffled, count, steps_done), None
 
     numbered = (jnp.arange(spec.n_epochs), jnp.stack(epoch_keys))
-    (descent, loss), _ = jax.lax.scan(epoch, (state.descent, state.loss), numbered)
-    return state.after(descent, loss)
+    (train_state, loss), _ = jax.lax.scan(epoch, (state.train_state, state.loss), numbered)
+    return state.after(train_state, loss)
 
 
 def learn(
-    spec: PPOSpec, hyper: PPOHyper, descent: Descent, rows: Float[Array, "size words"], count: Any, steps_done: Any
-) -> tuple[Descent, Float[Array, ""]]:
+    spec: PPOSpec,
+    hyper: PPOHyper,
+    train_state: TrainState,
+    rows: Float[Array, "size words"],
+    count: Any,
+    steps_done: Any,
+) -> tuple[TrainState, Float[Array, ""]]:
     """One epoch: a gradient step on each minibatch in the order of the rows; ``count`` numbers the first of them."""
     batches = rows.reshape(spec.minibatches, spec.batch_size, -1)
 
-    def step(carry: tuple[Descent, Array], numbered: tuple[Any, Array]) -> tuple[tuple[Descent, Array], None]:
+    def step(carry: tuple[TrainState, Array], numbered: tuple[Any, Array]) -> tuple[tuple[TrainState, Array], None]:
         number, batch = numbered
         loss, gradient = jax.value_and_grad(lambda w: ppo_loss(spec, hyper, w, _samples(batch)))(carry[0].weights)
-        descent = descend(
+        train_state = apply_gradients(
             _OPTIMIZER,
             carry[0],
             loss,
@@ -109,9 +114,9 @@ def learn(
             count=count + number,
             steps_done=steps_done,
         )
-        return (descent, loss), None
+        return (train_state, loss), None
 
-    return jax.lax.scan(step, (descent, jnp.float32(0)), (jnp.arange(spec.minibatches), batches))[0]
+    return jax.lax.scan(step, (train_state, jnp.float32(0)), (jnp.arange(spec.minibatches), batches))[0]
 
 
 def _permutation(key: Any, size: int) -> Array:

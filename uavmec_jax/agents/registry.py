@@ -9,12 +9,12 @@ from typing import Any
 from uavmec_jax.agents import a2c, dqn, ppo
 from uavmec_jax.agents.algorithm import Algorithm
 
-OF_THE_SCENARIO = ("total_steps", "n_devices", "max_age")
+SCENARIO_SETTINGS = ("total_steps", "n_devices", "max_age")
 """Static settings that follow from the study and its scenario."""
 
 
 @dataclass(frozen=True)
-class Declaration:
+class RegisteredAlgorithm:
     """One algorithm.
 
     Attributes:
@@ -36,10 +36,10 @@ class Declaration:
     def static(self) -> tuple[str, ...]:
         """Names of the settings that shape the program."""
         names = (field.name for field in dataclasses.fields(self.spec))
-        return tuple(name for name in names if name not in OF_THE_SCENARIO)
+        return tuple(name for name in names if name not in SCENARIO_SETTINGS)
 
     def spec_of(self, settings: Mapping[str, Any], **sizes: int) -> Any:
-        """The static settings among ``settings``, with those of :data:`OF_THE_SCENARIO` that the algorithm has."""
+        """The static settings among ``settings``, with those of :data:`SCENARIO_SETTINGS` that the algorithm has."""
         fields = {field.name for field in dataclasses.fields(self.spec)}
         chosen = {name: settings[name] for name in self.static}
         return self.spec(**chosen, **{name: size for name, size in sizes.items() if name in fields})
@@ -53,11 +53,11 @@ class Declaration:
         return self.bind(self.spec_of(settings, total_steps=total_steps, n_devices=n_devices, max_age=max_age))
 
 
-ALGORITHMS: Mapping[str, Declaration] = MappingProxyType(
+ALGORITHMS: Mapping[str, RegisteredAlgorithm] = MappingProxyType(
     {
-        "dqn": Declaration(dqn.DQNHyper, dqn.DQNSpec, dqn.algorithm),
-        "ppo": Declaration(ppo.PPOHyper, ppo.PPOSpec, ppo.algorithm),
-        "a2c": Declaration(a2c.A2CHyper, a2c.A2CSpec, a2c.algorithm),
+        "dqn": RegisteredAlgorithm(dqn.DQNHyper, dqn.DQNSpec, dqn.algorithm),
+        "ppo": RegisteredAlgorithm(ppo.PPOHyper, ppo.PPOSpec, ppo.algorithm),
+        "a2c": RegisteredAlgorithm(a2c.A2CHyper, a2c.A2CSpec, a2c.algorithm),
     }
 )
 """Name, as in study files -> declaration."""

@@ -2,7 +2,7 @@
 
 A row holds what a transition *adds*: the observation it led to, its action, reward and flags. The observation it
 started from is the previous row's, or the initial one if an episode ended there. So a sample costs two neighbouring
-rows (two cache lines) instead of five scattered arrays, and 75 agents x 1,000,000 transitions fit in 4.5 GiB.
+buffer_state (two cache lines) instead of five scattered arrays, and 75 agents x 1,000,000 transitions fit in 4.5 GiB.
 Battery fractions and rewards are kept to the bit; ages are small integers and are packed.
 """
 
@@ -82,10 +82,10 @@ class ReplaySpec:
         return 4 * (self.ring + 1) * self.words
 
 
-def init(spec: ReplaySpec) -> UInt[Array, "rows words"]:
+def init(spec: ReplaySpec) -> UInt[Array, "buffer_state words"]:
     """An empty memory ``[ring + 1, words]``; row 0 stands before the first transition: an episode ended there."""
-    rows = jnp.zeros((spec.ring + 1, spec.words), jnp.uint32)
-    return rows.at[0, -1].set(_ENDED)
+    buffer_state = jnp.zeros((spec.ring + 1, spec.words), jnp.uint32)
+    return buffer_state.at[0, -1].set(_ENDED)
 
 
 def pack(
@@ -109,20 +109,23 @@ def pack(
 
 
 def add(
-    spec: ReplaySpec, rows: UInt[Array, "rows words"], written: Int[Array, ""], new: UInt[Array, "stride words"]
-) -> UInt[Array, "rows words"]:
-    """Write ``stride`` rows; ``written`` (a multiple of ``stride``) transitions were written before."""
+    spec: ReplaySpec,
+    buffer_state: UInt[Array, "buffer_state words"],
+    written: Int[Array, ""],
+    new: UInt[Array, "stride words"],
+) -> UInt[Array, "buffer_state words"]:
+    """Write ``stride`` buffer_state; ``written`` (a multiple of ``stride``) transitions were written before."""
     place = written % spec.ring
-    rows = jax.lax.dynamic_update_slice(rows, new, (place + 1, 0))
+    buffer_state = jax.lax.dynamic_update_slice(buffer_state, new, (place + 1, 0))
     if spec.wraps:  # row 0 is the neighbour of row 1: once the ring is full, the ring's last row
-        first = jnp.where(place + spec.stride == spec.ring, new[-1], rows[0])
-        rows = jax.lax.dynamic_update_slice(rows, first[None], (0, 0))
-    return rows
+        first = jnp.where(place + spec.stride == spec.ring, new[-1], buffer_state[0])
+        buffer_state = jax.lax.dynamic_update_slice(buffer_state, first[None], (0, 0))
+    return buffer_state
 
 
 def sample(
     spec: ReplaySpec,
-    rows: UInt[Array, "rows words"],
+    buffer_state: UInt[Array, "buffer_state words"],
     written: Int[Array, ""],
     bits: UInt[Array, " B"],
     gamma: Any,
@@ -131,7 +134,7 @@ def sample(
 
     Args:
         spec: shape of the memory.
-        rows: the memory.
+        buffer_state: the memory.
         written: transitions written so far, at least 1.
         bits: ``[B]`` uniform 32-bit words, one per draw. (The modulo's bias is below capacity / 2**32.)
         gamma: discount of one slot.
@@ -139,12 +142,12 @@ def sample(
     size = jnp.minimum(written, spec.capacity)
     back = (bits % size.astype(jnp.uint32)).astype(jnp.int32)
     place = (written - 1 - back) % spec.ring
-    pairs = jax.vmap(lambda start: jax.lax.dynamic_slice(rows, (start, 0), (2, spec.words)))(place)
+    pairs = jax.vmap(lambda start: jax.lax.dynamic_slice(buffer_state, (start, 0), (2, spec.words)))(place)
     before, row = pairs[:, 0], pairs[:, 1]
     first = np.concatenate([np.ones(spec.n_devices, np.float32), np.zeros(spec.n_devices, np.float32)])
     reward, discount, last = _reward(row), jnp.broadcast_to(jnp.asarray(gamma, jnp.float32), back.shape), row
     if spec.n_step > 1:
-        reward, discount, last = _n_step(spec, rows, place, back, row, gamma)
+        reward, discount, last = _n_step(spec, buffer_state, place, back, row, gamma)
     return Transition(
         observation=jnp.where((before[:, -1:] & _ENDED) > 0, first, _observation(spec, before)),
         action=(row[:, -1] & (_TERMINATED - 1)).astype(jnp.int32),
@@ -157,7 +160,7 @@ def sample(
 
 def _n_step(
     spec: ReplaySpec,
-    rows: UInt[Array, "rows words"],
+    buffer_state: UInt[Array, "buffer_state words"],
     place: Int[Array, " B"],
     back: Int[Array, " B"],
     row: UInt[Array, "B words"],
@@ -171,7 +174,7 @@ def _n_step(
     goes_on = jnp.ones(place.shape, bool)
     total, discount, last = jnp.zeros(place.shape), jnp.ones(place.shape), row
     for k in range(spec.n_step):
-        now = rows[1 + (place + k) % spec.ring]
+        now = buffer_state[1 + (place + k) % spec.ring]
         goes_on = goes_on & (back >= k)
         total = total + jnp.where(goes_on, discount * _reward(now), 0.0)
         discount = jnp.where(goes_on, discount * gamma, discount)

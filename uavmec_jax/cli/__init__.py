@@ -1,11 +1,11 @@
-"""The command `uavmec`: parse, call, show. What it does lives in the package; jax is imported only when needed."""
+"""The command `uavmec`: parse, call, print. The work is done in the package; jax is imported only when it is needed."""
 
 from typing import Any
 
 import click
 
 from uavmec_jax.cli.advise import advise
-from uavmec_jax.cli.common import fail
+from uavmec_jax.cli.common import InputError
 from uavmec_jax.cli.machine import doctor
 from uavmec_jax.cli.runs import resume, status, submit, worker
 from uavmec_jax.cli.scenarios import evaluate, plan
@@ -15,36 +15,36 @@ from uavmec_jax.cli.traffic import traffic
 from uavmec_jax.errors import UserError
 
 
-class OneLine(click.Group):
-    """A group whose commands tell a user's mistake, or a full or closed disk, in one line: exit code 2."""
+class UavmecGroup(click.Group):
+    """A group whose commands report wrong input, or a full or closed disk, in one line."""
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command."""
         try:
             return super().invoke(ctx)
         except UserError as error:
-            fail(error)
+            raise InputError(str(error)) from error
         except OSError as error:
-            fail(f"{error.filename}: {error.strerror}" if error.filename else error)
+            raise InputError(f"{error.filename}: {error.strerror}" if error.filename else str(error)) from error
 
 
-@click.group(cls=OneLine, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=UavmecGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="uavmec-jax")
 def main() -> None:
     """Which device should a rescue UAV serve next, and which will fail first?
 
     \b
-    uavmec run table5 --quick     the paper's Table 5 on this machine, in under a minute
-    uavmec run my-study.toml      a study of your own
-    uavmec resume runs/...        go on with one that was stopped or killed
-    uavmec status runs/...        how far it is
-    uavmec search dqn             better settings: trials by the batch, each batch one program
-    uavmec advise my-town.toml    whom to visit next, what will fail first; no training needed
-    uavmec plan my-town.toml      tours for your own devices, what fails first, what to repair
-    uavmec show runs/...          the tables of a run again
-    uavmec traffic show albany    an evacuation, and which devices see it
-    uavmec evaluate runs/...      one of its policies on one scenario
-    uavmec compare runs/a runs/b  two runs, seed by seed
+    uavmec run table5 --quick         the paper's Table 5 on this machine, in under a minute
+    uavmec run my-study.toml          a study of your own
+    uavmec resume runs/...            resume a run that was stopped or killed
+    uavmec status runs/...            how far a run is
+    uavmec search dqn                 better settings: trials in batches, each batch one program
+    uavmec advise my-scenario.toml    which device to visit next, what will fail first; no training needed
+    uavmec plan my-scenario.toml      tours for your own devices, what fails first, what to repair
+    uavmec show runs/...              the tables of a run again
+    uavmec traffic show albany        an evacuation, and how much traffic each device sees
+    uavmec evaluate runs/...          a policy of a run on one scenario
+    uavmec compare runs/a runs/b      two runs, seed by seed
     """
 
 

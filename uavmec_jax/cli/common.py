@@ -1,44 +1,75 @@
-"""What the commands share: one line for a mistake, settings from the command line, tables on the terminal."""
+"""What the commands share: one line for wrong input, settings from the command line, tables on the terminal."""
 
 import json
 import sys
 import time
 import tomllib
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import IO, Any
 
 import click
 
 _EXAMPLES = {"--set": "--set dqn.gamma=0.99"}
 
 
+class InputError(click.ClickException):
+    """Wrong input: one line on standard error, exit code 2."""
+
+    exit_code = 2
+
+    def show(self, file: IO[Any] | None = None) -> None:
+        """Print the line."""
+        click.echo(f"uavmec: {' '.join(self.message.split())}", file=file, err=file is None)
+
+
+class Interrupt(click.ClickException):
+    """A signal ended the command: how to go on, and the exit code that shells expect."""
+
+    def __init__(self, message: str, signal: int) -> None:
+        super().__init__(message)
+        self.exit_code: int = 128 + signal  # type: ignore[misc]
+
+    def show(self, file: IO[Any] | None = None) -> None:
+        """Print the line."""
+        click.echo(f"interrupted: {self.message}", file=file, err=file is None)
+
+
 def assignment(text: str, option: str = "--set") -> tuple[str, Any]:
-    """``name=value`` with the value as in TOML; a bare word is a string."""
+    """Parse ``name=value`` with the value as in TOML; a bare word is a string.
+
+    Raises:
+        InputError: there is no ``=`` or no name.
+    """
     name, equals, value = text.partition("=")
     if not equals or not name.strip():
-        fail(f"{option} {text}: give NAME=VALUE, e.g. {_EXAMPLES.get(option, 'algorithm=dqn')}")
+        raise InputError(f"{option} {text}: give NAME=VALUE, e.g. {_EXAMPLES.get(option, 'algorithm=dqn')}")
     try:
         return name.strip(), tomllib.loads(f"value = {value}")["value"]
     except tomllib.TOMLDecodeError:
         return name.strip(), value.strip()
 
 
+def print_json(data: Any) -> None:
+    """Print plain data as JSON on standard output."""
+    click.echo(json.dumps(data, indent=1))
+
+
 def print_results(results: Any, directory: Path, console: Any, as_json: bool) -> None:
-    """The tables of a run, or its cells as JSON."""
+    """Print the tables of a run, or its cells as JSON."""
     from uavmec_jax.reporting.tables import summary, tables
     from uavmec_jax.studies.first_failures import place_frames
 
     if as_json:
-        told = {"directory": str(directory), "run": results.run}
+        data = {"directory": str(directory), "run": results.run}
         for name, table in {"cells": results.cells(), **place_frames(results)}.items():
-            told[name] = json.loads(table.to_json(orient="records"))
-        click.echo(json.dumps(told, indent=1))
+            data[name] = json.loads(table.to_json(orient="records"))
+        print_json(data)
         return
     print_tables(console, tables(results), summary(results), directory)
 
 
 def print_tables(console: Any, tables: dict[str, Any], lines: list[str], directory: Path | None = None) -> None:
-    """Titled tables, lines below them, and where the files are."""
+    """Print titled tables, lines below them, and where the files are."""
     for title, table in tables.items():
         console.print(f"[bold]{title}[/bold]")
         console.print(table)
@@ -49,16 +80,10 @@ def print_tables(console: Any, tables: dict[str, Any], lines: list[str], directo
 
 
 def new_folder(name: str) -> Path:
-    """Where a run or a plan goes unless the user says where."""
+    """Return the folder of a run or a tour unless the user names one."""
     return Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
 def command_line() -> str:
-    """The command as it was given, for the labels of results."""
+    """Return the command as it was given, for the labels of results."""
     return " ".join(["uavmec", *sys.argv[1:]])
-
-
-def fail(message: object) -> NoReturn:
-    """One line on standard error, exit code 2."""
-    click.echo(f"uavmec: {' '.join(str(message).split())}", err=True)
-    sys.exit(2)

@@ -1,31 +1,30 @@
 """Commands about the machine."""
 
-import json
-
 import click
+
+from uavmec_jax.cli.common import print_json
+from uavmec_jax.cli.options import json_option
 
 
 @click.command()
-@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
+@json_option
 def doctor(as_json: bool) -> None:
-    """Say versions, devices and memory, and check the speed for two seconds."""
+    """Print versions, devices and memory, and measure the speed for two seconds."""
     from uavmec_jax.training import host
 
-    host.use_every_core()
+    host.use_all_cores()
     from uavmec_jax.runs.speed import environment_speed
 
     facts = host.describe() | {"environment_steps_per_second": round(environment_speed(seconds=2.0))}
     facts["versions"]["libsumo"] = host.version("libsumo")
     if as_json:
-        click.echo(json.dumps(facts, indent=1))
+        print_json(facts)
         return
     for name, value in facts.items():
         if isinstance(value, dict):
             value = ", ".join(f"{key} {version}" for key, version in value.items())
         elif isinstance(value, list):
             value = ", ".join(value)
-        click.echo(
-            f"{name.replace('_', ' '):>30}  {value:,}"
-            if isinstance(value, int)
-            else f"{name.replace('_', ' '):>30}  {value}"
-        )
+        elif isinstance(value, int):
+            value = f"{value:,}"
+        click.echo(f"{name.replace('_', ' '):>30}  {value}")

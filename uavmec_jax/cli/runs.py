@@ -1,105 +1,72 @@
-"""Commands about runs that go on, stop, are taken up again, and have several workers."""
+"""Commands about runs under way: resumed, watched, shared by several workers."""
 
-import json
 import os
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import click
 
-from uavmec_jax.cli.common import assignment, command_line, fail, new_folder, print_results
-
-_DIRECTORY = click.argument("directory", type=click.Path(path_type=Path))
-_WORKERS = click.option(
-    "--workers", type=click.IntRange(1, 256), default=1, help="Processes on this machine (default: 1)."
+from uavmec_jax.cli.common import (
+    InputError,
+    Interrupt,
+    assignment,
+    command_line,
+    new_folder,
+    print_json,
+    print_results,
 )
+from uavmec_jax.cli.options import json_option, out_option, run_options, set_option
+from uavmec_jax.runs.options import RunOptions
+
+directory_argument = click.argument("directory", type=click.Path(path_type=Path))
+
+_EVENTS = {
+    "damaged": "shard {shard}: {error}; it is set aside",
+    "restored": "shard {shard} resumes from {file}, step {steps:,}",
+    "failed": "shard {shard} failed: {error}",
+    "lost": "{error}",
+    "died": "worker {pid} died (exit code {exit_code}); the others take over",
+}
+"""The events of a run that a person should see."""
 
 
-def durability_options(command: Callable) -> Callable:
-    """The options that say how a run is cut and kept."""
-    for option in reversed(
-        (
-            _WORKERS,
-            click.option(
-                "--shard-size", type=click.IntRange(1), help="Most agents in a shard (default: what caches hold)."
-            ),
-            click.option(
-                "--snapshot",
-                type=click.Choice(["full", "weights"]),
-                default="full",
-                help="Of a shard in training, keep all (it goes on from there) or weights alone (it starts again).",
-            ),
-            click.option(
-                "--snapshot-every",
-                "snapshot_every_s",
-                type=click.FloatRange(0),
-                default=60.0,
-                help="Seconds between snapshots, at least (default: 60).",
-            ),
-            click.option(
-                "--snapshot-share",
-                type=click.FloatRange(0.001, 1),
-                default=0.02,
-                help="Share of the time that they may take (default: 0.02): large ones come less often.",
-            ),
-            click.option(
-                "--lease",
-                "lease_s",
-                type=click.FloatRange(1),
-                default=60.0,
-                help="Seconds without a sign after which a worker on another machine counts as dead (default: 60).",
-            ),
-            click.option("--tensorboard", is_flag=True, help="Write TensorBoard event files too (needs tensorboardX)."),
-        )
-    ):
-        command = option(command)
-    return command
+def event_printer(console: Any) -> Callable[[str, dict[str, Any]], None]:
+    """Return a function that prints those events of a run that a person should see."""
+
+    def print_event(event: str, facts: dict[str, Any]) -> None:
+        if event in _EVENTS:
+            console.print(_EVENTS[event].format(**facts), highlight=False, soft_wrap=True)
+
+    return print_event
 
 
-def teller(console: Any) -> Callable[[str, dict[str, Any]], None]:
-    """Prints those events of a run that a person should see."""
-    lines = {
-        "damaged": "shard {shard}: {error}; it is set aside",
-        "restored": "shard {shard} goes on from {file}, step {steps:,}",
-        "failed": "shard {shard} failed: {error}",
-        "lost": "{error}",
-        "died": "worker {pid} died (exit code {exit_code}); the others take over",
-    }
+def report_results(results: Any, directory: Path, console: Any, as_json: bool) -> None:
+    """Print tables and draw the figure of what is finished.
 
-    def tell(event: str, facts: dict[str, Any]) -> None:
-        if event in lines:
-            console.print(lines[event].format(**facts), highlight=False, soft_wrap=True)
-
-    return tell
-
-
-def conclude(results: Any, directory: Path, console: Any, as_json: bool) -> None:
-    """Tables and figure of what is finished; if that is not all, how to go on, and the exit code of the signal."""
+    Raises:
+        Interrupt: that is not all of the run; it says how to go on.
+    """
     from uavmec_jax.reporting import canvas, figures
 
     if len(results.agents):
         canvas.save(figures.run_figure(results), directory / "figure.png")
         print_results(results, directory, console, as_json)
     if not results.run["complete"]:
-        done, of = len(results.agents), results.run["agents"]
-        click.echo(
-            f"interrupted: {done:,} of {of:,} agents are finished; go on with: uavmec resume {directory}", err=True
-        )
-        sys.exit(128 + results.run["stopped_by"])
+        finished = f"{len(results.agents):,} of {results.run['agents']:,} agents are finished"
+        raise Interrupt(f"{finished}; go on with: uavmec resume {directory}", results.run["stopped_by"])
 
 
 @click.command()
-@_DIRECTORY
+@directory_argument
 @click.option("--workers", type=click.IntRange(1, 256), help="Processes on this machine (default: as planned).")
-@click.option("--other-code", is_flag=True, help="Go on although code or libraries have changed; the bits may differ.")
-@click.option("--json", "as_json", is_flag=True, help="Print the cells as JSON on standard output.")
+@click.option("--other-code", is_flag=True, help="Resume although code or libraries changed; the bits may differ.")
+@json_option
 def resume(directory: Path, workers: int | None, other_code: bool, as_json: bool) -> None:
-    """Go on with the run in DIRECTORY, which was stopped or killed, and end as if nothing had happened."""
+    """Resume the run in DIRECTORY, which was stopped or killed; it ends with the same bits."""
     from uavmec_jax.training import host
 
-    host.use_every_core()
+    host.use_all_cores()
     from rich.console import Console
 
     from uavmec_jax.reporting.progress import progress_bar
@@ -111,16 +78,20 @@ def resume(directory: Path, workers: int | None, other_code: bool, as_json: bool
     console.print(f"[bold]{directory}[/bold]: {plan}", soft_wrap=True)
     with progress_bar(console, plan) as on_progress:
         results = resume_run(
-            directory, workers=workers, other_code=other_code, on_progress=on_progress, on_event=teller(console)
+            directory,
+            workers=workers,
+            other_code=other_code,
+            on_progress=on_progress,
+            on_event=event_printer(console),
         )
-    conclude(results, directory, console, as_json)
+    report_results(results, directory, console, as_json)
 
 
 @click.command()
-@_DIRECTORY
-@click.option("--json", "as_json", is_flag=True, help="Print as JSON on standard output.")
+@directory_argument
+@json_option
 def status(directory: Path, as_json: bool) -> None:
-    """How far the run in DIRECTORY is: shards, speed, time left, disk."""
+    """Print how far the run in DIRECTORY is: shards, speed, time left, disk."""
     from rich.console import Console
 
     from uavmec_jax.reporting.status import status_lines
@@ -128,14 +99,14 @@ def status(directory: Path, as_json: bool) -> None:
 
     found = run_status(directory)
     if as_json:
-        click.echo(json.dumps(found.as_json(), indent=1))
+        print_json(found.as_json())
         return
     for line in status_lines(found):
         Console().print(line, highlight=False, soft_wrap=True)
 
 
 @click.command()
-@_DIRECTORY
+@directory_argument
 @click.option("--share", metavar="I/N", help="Use the I-th of N equal parts of this machine's cores.")
 @click.option(
     "--no-wait", is_flag=True, help="End when no shard is free, instead of waiting to take over from the dead."
@@ -144,19 +115,16 @@ def worker(directory: Path, share: str | None, no_wait: bool) -> None:
     """Work on the run in DIRECTORY beside others, on this machine or on any that shares the folder."""
     from uavmec_jax.training import host
 
-    host.use_every_core(_share(share))
+    host.use_all_cores(_share(share))
     from rich.console import Console
 
     from uavmec_jax.runs.shared_run import work_on
-    from uavmec_jax.runs.signals import Stopped
+    from uavmec_jax.runs.signals import Interrupted
 
     try:
-        complete = work_on(directory, wait=not no_wait, on_event=teller(Console()))
-    except Stopped as stopped:
-        click.echo(
-            f"interrupted: what this worker had is kept; start another with: uavmec worker {directory}", err=True
-        )
-        sys.exit(128 + stopped.signal)
+        complete = work_on(directory, wait=not no_wait, on_event=event_printer(Console()))
+    except Interrupted as stop:
+        raise Interrupt(f"progress is saved; start another with: uavmec worker {directory}", stop.signal) from stop
     click.echo(
         f"{directory}: {'complete' if complete else 'no shard is free; others are still at work or have failed'}"
     )
@@ -168,7 +136,7 @@ def _share(text: str | None) -> tuple[int, int] | None:
         return None
     part, slash, of = text.partition("/")
     if not slash or not part.isdigit() or not of.isdigit() or not 1 <= int(part) <= int(of):
-        fail(f"--share {text}: give I/N, e.g. 1/2 for the first half of the cores")
+        raise InputError(f"--share {text}: give I/N, e.g. 1/2 for the first half of the cores")
     return int(part), int(of)
 
 
@@ -179,11 +147,9 @@ def _share(text: str | None) -> tuple[int, int] | None:
 @click.option(
     "--with", "parameters", multiple=True, metavar="NAME=VALUE", help="For submitit, e.g. --with slurm_partition=cpu."
 )
-@click.option(
-    "--set", "settings", multiple=True, metavar="NAME=VALUE", help="Override any setting, as in `uavmec run`."
-)
-@click.option("--out", type=click.Path(path_type=Path), help="Folder of the run, which all hosts must see.")
-@durability_options
+@set_option(help="Override any setting, as in `uavmec run`.")
+@out_option(help="Folder of the run, which all hosts must see.")
+@run_options
 def submit(
     study: str,
     jobs: int,
@@ -193,20 +159,18 @@ def submit(
     out: Path | None,
     workers: int,
     shard_size: int | None,
-    **durability: Any,
+    **options: Any,
 ) -> None:
     """Plan STUDY and submit workers for it to a cluster (SLURM) by submitit: pip install 'uavmec-jax[cluster]'."""
     from uavmec_jax.training import host
 
-    host.use_every_core()
+    host.use_all_cores()
     from uavmec_jax.runs.cluster import submit_workers
-    from uavmec_jax.runs.folder import Durability
     from uavmec_jax.runs.shared_run import prepare_run
     from uavmec_jax.studies.study import load_study
 
     resolved = load_study(study, dict(assignment(setting) for setting in settings))
     directory = out or new_folder(resolved.name)
-    options = dict(assignment(one, "--with") for one in parameters)
 
     def prepare() -> Path:
         prepare_run(
@@ -216,30 +180,39 @@ def submit(
             workers=workers,
             shard_size=shard_size,
             jobs=jobs,
-            durability=Durability(**durability),
+            options=RunOptions(**options),
         )
         return directory.absolute()
 
-    names = submit_workers(prepare, jobs, executor, options)
+    names = submit_workers(prepare, jobs, executor, dict(assignment(one, "--with") for one in parameters))
     click.echo(f"{directory}: {len(names)} workers submitted ({', '.join(names[:4])}{', ...' * (len(names) > 4)})")
     click.echo(f"how far it is: uavmec status {directory}; the results, when it is complete: uavmec show {directory}")
 
 
-def tell_simulation(
+def print_simulation(
     study: Any,
     speed: float | None,
     devices: int | None,
     workers: int,
     shard_size: int | None,
-    durability: Any,
+    options: RunOptions,
     as_json: bool,
 ) -> None:
-    """What a run would take, for a given speed."""
-    from uavmec_jax.runs.run_plan import plan_study
+    """Print what a run would take at a given speed.
+
+    Raises:
+        InputError: no speed is given.
+    """
+    from uavmec_jax.runs.run_plan import plan_run
     from uavmec_jax.runs.simulate import simulate
 
     if speed is None:
-        fail("--simulate needs --speed, the training steps per second of one device; `uavmec doctor` measures it")
-    plan = plan_study(study, workers=workers, shard_size=shard_size)
-    found = simulate(study, plan, speed=speed, devices=devices or os.cpu_count() or 1, durability=durability)
-    click.echo(json.dumps(found.as_json(), indent=1) if as_json else f"{study.name}: {plan}\n{found}")
+        raise InputError(
+            "--simulate needs --speed, the training steps per second of one device; `uavmec doctor` measures it"
+        )
+    plan = plan_run(study, workers=workers, shard_size=shard_size)
+    found = simulate(study, plan, speed=speed, devices=devices or os.cpu_count() or 1, options=options)
+    if as_json:
+        print_json(found.as_json())
+    else:
+        click.echo(f"{study.name}: {plan}\n{found}")

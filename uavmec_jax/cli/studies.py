@@ -1,13 +1,14 @@
 """Commands about studies and the runs they leave."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 import click
 
-from uavmec_jax.cli.common import assignment, command_line, new_folder, print_results, print_tables
-from uavmec_jax.cli.runs import conclude, durability_options, tell_simulation, teller
+from uavmec_jax.cli.common import assignment, command_line, new_folder, print_json, print_results, print_tables
+from uavmec_jax.cli.options import json_option, out_option, run_options, set_option
+from uavmec_jax.cli.runs import directory_argument, event_printer, print_simulation, report_results
+from uavmec_jax.runs.options import RunOptions
 
 QUICK_STEPS, QUICK_SEEDS, QUICK_VALIDATE_EVERY = 50_000, 3, 5_000
 
@@ -19,16 +20,10 @@ QUICK_STEPS, QUICK_SEEDS, QUICK_VALIDATE_EVERY = 50_000, 3, 5_000
 @click.option(
     "--quick", is_flag=True, help=f"{QUICK_SEEDS} seeds x {QUICK_STEPS:,} steps: a first look within a minute."
 )
-@click.option(
-    "--set",
-    "settings",
-    multiple=True,
-    metavar="NAME=VALUE",
-    help="Override any setting, e.g. --set dqn.gamma=0.99 or --set axes.learning_rate=[0.001,0.0071].",
-)
-@click.option("--out", type=click.Path(path_type=Path), help="Folder of the run (default: runs/<study>-<time>).")
-@click.option("--json", "as_json", is_flag=True, help="Print the cells as JSON on standard output.")
-@durability_options
+@set_option(help="Override any setting, e.g. --set dqn.gamma=0.99 or --set axes.learning_rate=[0.001,0.0071].")
+@out_option(help="Folder of the run (default: runs/<study>-<time>).")
+@json_option
+@run_options
 @click.option("--simulate", is_flag=True, help="Print what the run would take, and run nothing.")
 @click.option("--speed", type=float, help="For --simulate: training steps per second of one device.")
 @click.option("--devices", type=int, help="For --simulate: number of devices (default: those of this machine).")
@@ -45,31 +40,30 @@ def run(
     devices: int | None,
     workers: int,
     shard_size: int | None,
-    **durability: Any,
+    **options: Any,
 ) -> None:
-    """Train and judge STUDY: a study that ships with the package (table5, table6, table7, planning, ...) or a TOML file."""
+    """Train and evaluate STUDY: one that ships with the package (table5, table6, table7, planning, ...) or a TOML file."""
     overrides = _overrides(quick, seeds, steps, settings)
 
     from uavmec_jax.training import host
 
-    host.use_every_core()
+    host.use_all_cores()
     from rich.console import Console
 
     from uavmec_jax.reporting.progress import progress_bar
-    from uavmec_jax.runs.folder import Durability
     from uavmec_jax.runs.results_folder import check_directory
     from uavmec_jax.runs.run import run_study
-    from uavmec_jax.runs.run_plan import plan_study
+    from uavmec_jax.runs.run_plan import plan_run
     from uavmec_jax.studies.study import load_study
 
     console = Console(stderr=as_json)
     resolved = load_study(study, overrides)
     if simulate:
-        tell_simulation(resolved, speed, devices, workers, shard_size, Durability(**durability), as_json)
+        print_simulation(resolved, speed, devices, workers, shard_size, RunOptions(**options), as_json)
         return
     directory = out or new_folder(resolved.name)
     check_directory(directory)
-    plan = plan_study(resolved, workers=workers, shard_size=shard_size)
+    plan = plan_run(resolved, workers=workers, shard_size=shard_size)
     console.print(f"[bold]{resolved.name}[/bold]: {plan}")
     with progress_bar(console, plan) as on_progress:
         results = run_study(
@@ -78,15 +72,15 @@ def run(
             command=command_line(),
             workers=workers,
             shard_size=shard_size,
-            durability=Durability(**durability),
+            options=RunOptions(**options),
             on_progress=on_progress,
-            on_event=teller(console),
+            on_event=event_printer(console),
         )
-    conclude(results, directory, console, as_json)
+    report_results(results, directory, console, as_json)
 
 
 def _overrides(quick: bool, seeds: int | None, steps: int | None, settings: tuple[str, ...]) -> dict[str, Any]:
-    """What the options change in a study."""
+    """The settings of a study that the options change."""
     overrides: dict[str, Any] = {}
     if quick:
         overrides |= {
@@ -100,8 +94,8 @@ def _overrides(quick: bool, seeds: int | None, steps: int | None, settings: tupl
 
 
 @click.command()
-@click.argument("directory", type=click.Path(path_type=Path))
-@click.option("--json", "as_json", is_flag=True, help="Print the cells as JSON on standard output.")
+@directory_argument
+@json_option
 def show(directory: Path, as_json: bool) -> None:
     """Print the tables of the run in DIRECTORY again."""
     from rich.console import Console
@@ -119,7 +113,7 @@ def show(directory: Path, as_json: bool) -> None:
 @click.option("--b", "where_b", multiple=True, metavar="NAME=VALUE", help="Agents of B.")
 @click.option("--policy-a", default="best", help="Policy of A: best, last, oldest-first, ... (default: best).")
 @click.option("--policy-b", default="best", help="Policy of B (default: best).")
-@click.option("--json", "as_json", is_flag=True, help="Print as JSON on standard output.")
+@json_option
 def compare(
     run_a: Path,
     run_b: Path,
@@ -140,7 +134,7 @@ def compare(
     b = Side(load_results(run_b), policy_b, dict(assignment(one, "--b") for one in where_b))
     tables, data = comparison(a, b)
     if as_json:
-        click.echo(json.dumps({"command": command_line(), **data}, indent=1))
+        print_json({"command": command_line(), **data})
         return
     print_tables(Console(), tables, [])
 

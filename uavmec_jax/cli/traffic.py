@@ -1,6 +1,5 @@
 """Commands about evacuation traffic."""
 
-import json
 import os
 import re
 from pathlib import Path
@@ -8,7 +7,8 @@ from typing import Any
 
 import click
 
-from uavmec_jax.cli.common import assignment, command_line, fail
+from uavmec_jax.cli.common import InputError, assignment, command_line, print_json
+from uavmec_jax.cli.options import json_option, set_option
 
 
 @click.group()
@@ -36,11 +36,9 @@ def traffic() -> None:
 )
 @click.option("--vehicles", type=int, help="Vehicles that are evacuated.")
 @click.option("--seeds", type=int, help="Simulations that are averaged.")
-@click.option(
-    "--set", "settings", multiple=True, metavar="NAME=VALUE", help="Any setting, e.g. demand.warm_up_s=300.0."
-)
+@set_option(help="Any setting, e.g. demand.warm_up_s=300.0.")
 @click.option("--out", type=click.Path(path_type=Path), help="File to write (default: <place>.npz).")
-@click.option("--json", "as_json", is_flag=True, help="Print the devices as JSON on standard output.")
+@json_option
 def build(
     place: str | None,
     osm: Path | None,
@@ -57,9 +55,9 @@ def build(
 ) -> None:
     """Simulate the evacuation of PLACE (a TOML file, or one that ships with the package) or of a map or network."""
     if sum(source is not None for source in (place, osm, net)) != 1:
-        fail("give one of PLACE, --osm FILE and --net FILE")
+        raise InputError("give one of PLACE, --osm FILE and --net FILE")
     if bbox is not None and osm is None:
-        fail(f"--bbox {bbox}: cuts an OpenStreetMap extract; give --osm too")
+        raise InputError(f"--bbox {bbox}: cuts an OpenStreetMap extract; give --osm too")
     from rich.console import Console
 
     from uavmec_jax.traffic.build import build_evacuation
@@ -86,11 +84,13 @@ def build(
 @click.argument("source")
 @click.option("--figure", type=click.Path(path_type=Path), help="Draw the road map (.png, .svg or .pdf).")
 @click.option("--animation", type=click.Path(path_type=Path), help="Draw one evacuation slot by slot (.gif).")
-@click.option("--policy", default="earliest-deadline", help="Who flies in the animation: a rule, or a policy file.")
+@click.option(
+    "--policy", default="earliest-deadline", help="AgentIds flies in the animation: a rule, or a policy file."
+)
 @click.option("--powered", type=int, default=8, help="Devices with grid power in the animation (default: 8).")
 @click.option("--connected", type=int, default=6, help="Devices with communication in the animation (default: 6).")
 @click.option("--seed", type=int, default=0, help="Of hardware, power, communication and task volumes.")
-@click.option("--json", "as_json", is_flag=True, help="Print the devices as JSON on standard output.")
+@json_option
 def show(
     source: str,
     figure: Path | None,
@@ -107,7 +107,7 @@ def show(
     evacuation = load_evacuation(source)
     for path, endings in ((figure, (".png", ".svg", ".pdf")), (animation, (".gif",))):
         if path is not None and path.suffix.lower() not in endings:
-            fail(f"{path}: ends in {path.suffix!r}; it should end in {' or '.join(endings)}")
+            raise InputError(f"{path}: ends in {path.suffix!r}; it should end in {' or '.join(endings)}")
     written = []
     if figure is not None:
         from uavmec_jax.reporting.canvas import save
@@ -121,9 +121,9 @@ def show(
         from uavmec_jax.scenarios.policies import load_policy
 
         chosen = load_policy(policy)
-        inventory, keys = load_scenario(None, place=source, powered=powered, connected=connected, seed=seed)
+        scenario = load_scenario(place=source, powered=powered, connected=connected, seed=seed)
         title = f"{evacuation.name}, {Path(policy).name}"
-        save_animation(animation, evacuation, inventory.params, inventory.layout, chosen, keys[0], title)
+        save_animation(animation, evacuation, scenario.params, scenario.layout, chosen, scenario.draws(1)[0], title)
         written.append(animation)
     _print(evacuation, source, as_json)
     for path in written:
@@ -137,7 +137,7 @@ def _print(evacuation: Any, source: str, as_json: bool) -> None:
     from uavmec_jax.reporting.evacuation import evacuation_data, evacuation_lines, evacuation_table
 
     if as_json:
-        click.echo(json.dumps(evacuation_data(evacuation), indent=1))
+        print_json(evacuation_data(evacuation))
         return
     console = Console()
     console.print(f"[bold]{evacuation.name}[/bold]: {evacuation.meta['description']}", highlight=False)
@@ -168,12 +168,12 @@ def _changes(
     for dotted, value in map(assignment, settings):
         table, _, name = dotted.partition(".")
         if not name:
-            fail(f"--set {dotted}: name a table and a setting, e.g. demand.vehicles=2000")
+            raise InputError(f"--set {dotted}: name a table and a setting, e.g. demand.vehicles=2000")
         changes.setdefault(table, {})[name] = value
     if devices is not None:
         changes["device"] = parse_toml(read_text(devices, TrafficError), devices, TrafficError).get("device", [])
         if not changes["device"]:
-            fail(f"{devices}: holds no [[device]] tables")
+            raise InputError(f"{devices}: holds no [[device]] tables")
     return changes
 
 
@@ -185,7 +185,7 @@ def _exit(text: str) -> tuple[str, Any]:
     try:
         return name, float(weight)
     except ValueError:
-        fail(f"--exit {text}: the weight is {weight!r}; give NAME=WEIGHT with a number above 0")
+        raise InputError(f"--exit {text}: the weight is {weight!r}; give NAME=WEIGHT with a number above 0")
 
 
 def _box(text: str) -> tuple[float, ...]:
@@ -194,14 +194,14 @@ def _box(text: str) -> tuple[float, ...]:
     except ValueError:
         sides = ()
     if len(sides) != 4:
-        fail(f"--bbox {text}: give west,south,east,north in degrees, e.g. 9.68,50.85,9.74,50.885")
+        raise InputError(f"--bbox {text}: give west,south,east,north in degrees, e.g. 9.68,50.85,9.74,50.885")
     return sides
 
 
 def _target(path: Path) -> Path:
     """A file that can be written, known before anything is simulated."""
     if path.suffix != ".npz":
-        fail(f"--out {path}: ends in {path.suffix!r}; it should end in .npz")
+        raise InputError(f"--out {path}: ends in {path.suffix!r}; it should end in .npz")
     if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
-        fail(f"--out {path}: {path.parent} is not a folder that can be written to")
+        raise InputError(f"--out {path}: {path.parent} is not a folder that can be written to")
     return path

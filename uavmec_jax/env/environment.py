@@ -13,7 +13,7 @@ from uavmec_jax.env.dynamics import Cause, State, initial_state
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.observation import observe_as_paper
 from uavmec_jax.env.params import Params
-from uavmec_jax.env.scenario import Scenario, advance, draw_volumes, is_truncated, make_scenario, restart_if
+from uavmec_jax.env.scenario import Scenario, advance, auto_reset, draw_volumes, is_truncated, make_scenario
 
 
 @dataclass(frozen=True)
@@ -26,11 +26,11 @@ class UavMecEnv:
     observation as ``info["final_observation"]``.
 
     Attributes:
-        see: ``(params, layout, state) -> observation``, an array or a pytree; by default the paper's.
+        observation_fn: ``(params, layout, state) -> observation``, an array or a pytree; by default the paper's.
             :func:`uavmec_jax.observe_devices` is the full one.
     """
 
-    see: Callable[[Params, Layout, State], Any] = observe_as_paper
+    observation_fn: Callable[[Params, Layout, State], Any] = observe_as_paper
     name: ClassVar[str] = "UavMec"
 
     @property
@@ -45,7 +45,9 @@ class UavMecEnv:
     def observation_shape(self, params: Scenario) -> Any:
         """Shape of an observation; of one that is a pytree, the tree of its leaves' shapes."""
         state = jax.eval_shape(initial_state, params.params, params.layout)
-        return jax.tree.map(lambda leaf: leaf.shape, jax.eval_shape(self.see, params.params, params.layout, state))
+        return jax.tree.map(
+            lambda leaf: leaf.shape, jax.eval_shape(self.observation_fn, params.params, params.layout, state)
+        )
 
     @partial(jax.jit, static_argnames=("self",))
     def reset(self, key: PRNGKeyArray, params: Scenario | None = None) -> tuple[Any, State]:
@@ -73,7 +75,7 @@ class UavMecEnv:
         terminated = outcome.cause != Cause.NONE
         truncated = is_truncated(scenario, after, outcome)
         final_observation = self._seen(scenario, after)
-        next_state = restart_if(terminated | truncated, scenario, after)
+        next_state = auto_reset(terminated | truncated, scenario, after)
         info = {
             "terminated": terminated,
             "truncated": truncated,
@@ -88,4 +90,4 @@ class UavMecEnv:
         return self._seen(scenario, next_state), next_state, reward, terminated, truncated, info
 
     def _seen(self, scenario: Scenario, state: State) -> Any:
-        return self.see(scenario.params, scenario.layout, state)
+        return self.observation_fn(scenario.params, scenario.layout, state)

@@ -8,7 +8,7 @@ _LARGEST = 500.0
 """64 terms of this size fit into 32 bits."""
 
 
-def sum_in_any_order(x: Float[Array, "*s"], axis: int = -1) -> Float[Array, "*t"]:
+def order_independent_sum(x: Float[Array, "*s"], axis: int = -1) -> Float[Array, "*t"]:
     """The sum over an axis of at most 64 terms, the same to the bit in whatever order they come.
 
     It is taken in fixed point: terms are rounded to steps of 2**-16, and cut where they pass +-500.

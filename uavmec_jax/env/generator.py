@@ -10,7 +10,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from uavmec_jax.env import hardware as tables
-from uavmec_jax.env.layout import Layout, Traffic, make_layout, only_present
+from uavmec_jax.env.layout import Layout, Traffic, make_layout, mask_absent
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rewards import Reward
 from uavmec_jax.env.scenario import Scenario
@@ -86,7 +86,7 @@ def sample_scenario(distribution: ScenarioDistribution, key: PRNGKeyArray) -> Sc
     )
 
 
-def scenario_of_draw(distribution: ScenarioDistribution, key: PRNGKeyArray) -> Scenario:
+def scenario_from_draw(distribution: ScenarioDistribution, key: PRNGKeyArray) -> Scenario:
     """The scenario that a draw stands for; the volumes of :func:`rollout` with the same key are the rest of it."""
     return sample_scenario(distribution, jax.random.fold_in(key, _SCENARIO_STREAM))
 
@@ -136,7 +136,7 @@ def _layout(
         active_power=layout.active_power * factors[:, 1],
         processing_rate=layout.processing_rate * factors[:, 2],
     )
-    return only_present(layout, present)
+    return mask_absent(layout, present)
 
 
 def _first(order: Float[Array, " n"], present: Bool[Array, " n"], count: Any) -> Bool[Array, " n"]:

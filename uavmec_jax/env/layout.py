@@ -1,4 +1,4 @@
-"""Layouts: what one random draw, or one user's inventory, fixes about the devices."""
+"""Layouts: what one random draw, or one user's named_scenario, fixes about the devices."""
 
 import math
 from dataclasses import replace
@@ -127,7 +127,7 @@ _NOWHERE_M = 1e6
 """Where entries stand that are no devices: out of everybody's range and beyond the UAV's battery."""
 
 
-def only_present(layout: Layout, present: Bool[Array, " n"]) -> Layout:
+def mask_absent(layout: Layout, present: Bool[Array, " n"]) -> Layout:
     """The layout with the entries that are not ``present`` made harmless: they lack nothing, do nothing and are far away.
 
     Every function of the package then treats them rightly without knowing of them; who offers actions masks them.
@@ -165,4 +165,4 @@ def pad_layout(layout: Layout, size: int) -> Layout:
     if traffic is not None:
         traffic = replace(traffic, weight=jnp.pad(jnp.asarray(traffic.weight), ((0, 0), (0, size - n))))
     bare = jax.tree.map(fill, replace(layout, traffic=None, present=None))
-    return only_present(replace(bare, traffic=traffic), fill(present))
+    return mask_absent(replace(bare, traffic=traffic), fill(present))

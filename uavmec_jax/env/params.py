@@ -6,6 +6,9 @@ from typing import Any
 import jax.numpy as jnp
 from flax import struct
 
+MAX_DEVICES = 64
+"""Most devices of a scenario."""
+
 Scalar = Any
 """A Python number, or an array: ``[]`` for one scenario, ``[B]`` for a batch under ``vmap``."""
 
@@ -26,7 +29,7 @@ class Params:
     """Longest slant distance (altitude included) at which a device is served."""
     uav_altitude_m: Scalar = 10.0
     uav_battery_j: Scalar = struct.field(default=1_600_000.0, metadata={"gt": 0})
-    n_devices: int = struct.field(pytree_node=False, default=12, metadata={"ge": 2, "le": 64})
+    n_devices: int = struct.field(pytree_node=False, default=12, metadata={"ge": 2, "le": MAX_DEVICES})
     bandwidth_hz: Scalar = struct.field(default=20e6, metadata={"gt": 0})
     noise_power_dbm: Scalar = struct.field(default=-100.0, metadata={"ge": -300, "le": 300})
     reference_gain_db_at_1m: Scalar = struct.field(default=-50.0, metadata={"ge": -300, "le": 300})
@@ -62,4 +65,6 @@ class Params:
         return 10.0 ** (jnp.asarray(self.reference_gain_db_at_1m, jnp.float32) / 10.0)
 
 
-MAX_DEVICES = 64
+def leaf_dtype(default: Any) -> Any:
+    """Return the dtype of a traced leaf whose default is a Python number: bool, int32 or float32."""
+    return {bool: jnp.bool_, int: jnp.int32}.get(type(default), jnp.float32)

@@ -9,7 +9,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
 from uavmec_jax.env.dynamics import Cause, Outcome, State, initial_state, transition
-from uavmec_jax.env.generator import ScenarioDistribution, scenario_of_draw
+from uavmec_jax.env.generator import ScenarioDistribution, scenario_from_draw
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.scenario import Scenario, advance, draw_volumes
@@ -58,15 +58,15 @@ def rollout(policy: Policy, params: Params, layout: Layout, key: PRNGKeyArray) -
         key: the volume draw. Two policies given the same key meet the same volumes, slot by slot. The policy's own
             randomness comes from another stream of the key.
     """
-    return play_on(policy, params, layout, initial_state(params, layout), key)
+    return rollout_from(policy, params, layout, initial_state(params, layout), key)
 
 
-def play_on(policy: Policy, params: Params, layout: Layout, state: State, key: PRNGKeyArray) -> Episode:
+def rollout_from(policy: Policy, params: Params, layout: Layout, state: State, key: PRNGKeyArray) -> Episode:
     """Play an episode to its end from any state that has not failed; otherwise as :func:`rollout`."""
     return _play(policy, params, layout, state, key, slots=0)[1]
 
 
-def recorded(
+def rollout_with_actions(
     policy: Policy, params: Params, layout: Layout, key: PRNGKeyArray, slots: int
 ) -> tuple[Int[Array, " slots"], Episode]:
     """As :func:`rollout`, and the devices visited in the first ``slots`` slots; -1 after the end."""
@@ -193,14 +193,14 @@ def tour_policy(actions: Int[Array, " H"]) -> Policy:
     return lambda params, layout, state, key=None: actions[state.slot]
 
 
-def play_draws(policy: Policy, plays: Scenario | ScenarioDistribution, keys: Key[Array, " D"]) -> Episode:
+def rollout_draws(policy: Policy, plays: Scenario | ScenarioDistribution, keys: Key[Array, " D"]) -> Episode:
     """One episode per draw, leaves ``[D]``: of task volumes, or, of a distribution, of a scenario each besides."""
     if isinstance(plays, Scenario):
         return rollouts(policy, plays.params, plays.layout, keys)
     return jax.vmap(lambda key: _rollout_draw(policy, plays, key)[1])(keys)
 
 
-def priced_lives(policy: Policy, plays: ScenarioDistribution, keys: Key[Array, " D"]) -> Float[Array, " D"]:
+def priced_lifetimes(policy: Policy, plays: ScenarioDistribution, keys: Key[Array, " D"]) -> Float[Array, " D"]:
     """Slots that the episode of each draw lives, less the price of its first failure."""
 
     def one(key: PRNGKeyArray) -> Array:
@@ -212,5 +212,5 @@ def priced_lives(policy: Policy, plays: ScenarioDistribution, keys: Key[Array, "
 
 def _rollout_draw(policy: Policy, plays: ScenarioDistribution, key: PRNGKeyArray) -> tuple[Layout, Episode]:
     """The layout of a draw and the episode in it."""
-    scenario = scenario_of_draw(plays, key)
+    scenario = scenario_from_draw(plays, key)
     return scenario.layout, rollout(policy, scenario.params, scenario.layout, key)

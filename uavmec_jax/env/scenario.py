@@ -51,7 +51,7 @@ def is_truncated(scenario: Scenario, state: State, outcome: Outcome) -> Array:
     return (outcome.cause == Cause.NONE) & (state.slot >= scenario.params.max_slots)
 
 
-def restart_if(ended: Bool[Array, ""], scenario: Scenario, state: State) -> State:
+def auto_reset(ended: Bool[Array, ""], scenario: Scenario, state: State) -> State:
     """The state an episode goes on from: a fresh one where it has ended."""
     fresh = initial_state(scenario.params, scenario.layout)
     return jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, state)

@@ -1,1 +1,1 @@
-"""Readers with limits, whole writes, checked archives and locks. Imports nothing of ours but the errors."""
+"""Readers with limits, atomic writes, checked archives and locks. Imports nothing of ours but the errors."""

@@ -44,7 +44,7 @@ def write_checked(
     *,
     compressed: bool = True,
 ) -> None:
-    """Write named arrays under a header of facts (what JSON can hold), schema and SHA-256, whole or not at all."""
+    """Write named arrays under a header of facts (what JSON can hold), schema and SHA-256, atomic or not at all."""
     header = {"schema": schema, "package": f"uavmec-jax {metadata.version('uavmec-jax')}", **facts}
     header["sha256"] = _digest(header, arrays)
     write_arrays(path, {_HEADER: np.array(json.dumps(header)), **arrays}, compressed=compressed)

@@ -1,8 +1,8 @@
-"""Who works on what in a folder that several processes and hosts share.
+"""AgentIds works on what in a folder that several processes and hosts share.
 
 A lease is a numbered file. To claim, a process creates the next number, which only one can; the highest number holds.
-The holder writes a new beat into its file every few seconds. Others take over when the holder is known to be dead (its
-process is gone on this very machine), when it has let go, or when they have seen no new beat for the lease's whole
+The holder writes a new heartbeat into its file every few seconds. Others take over when the holder is known to be dead (its
+process is gone on this very machine), when it has let go, or when they have seen no new heartbeat for the lease's atomic
 time by their own monotonic clock; so neither clocks that differ nor clocks that jump matter. A holder that was only
 asleep finds a higher number and stops (Gray and Cheriton, 1989; the number is a fencing token).
 """
@@ -20,11 +20,11 @@ from typing import Any
 import psutil
 
 from uavmec_jax.errors import StudyError
-from uavmec_jax.files.reading import read_facts
-from uavmec_jax.files.writing import whole
+from uavmec_jax.files.reading import read_json_or_empty
+from uavmec_jax.files.writing import atomic
 
 LEASE_S = 60.0
-"""Seconds without a beat after which a holder on another machine counts as dead."""
+"""Seconds without a heartbeat after which a holder on another machine counts as dead."""
 
 _BEATS_PER_LEASE = 6
 
@@ -42,32 +42,32 @@ def this_machine() -> str:
     return f"{socket.gethostname()} {boot}"
 
 
-def named(holder: dict[str, Any]) -> str:
+def describe_holder(holder: dict[str, Any]) -> str:
     """A holder in words."""
     return f"process {holder.get('pid', '?')} on {str(holder.get('machine', 'an unknown machine')).split()[0]}"
 
 
 @dataclass
 class Lease:
-    """A claim that is held. A thread of its own writes the beats.
+    """A claim that is held. A thread of its own writes the heartbeats.
 
     Attributes:
         folder: what is claimed.
         number: of the claim.
-        lease_s: seconds without a beat after which it is lost.
-        news: facts that each beat tells besides: progress.
+        lease_s: seconds without a heartbeat after which it is lost.
+        progress: what each heartbeat reports besides, e.g. steps.
     """
 
     folder: Path
     number: int
     lease_s: float
-    news: dict[str, Any] = field(default_factory=dict)
-    _beats: int = 0
+    progress: dict[str, Any] = field(default_factory=dict)
+    _heartbeats: int = 0
     _ended: threading.Event = field(default_factory=threading.Event)
     _writing: threading.Lock = field(default_factory=threading.Lock)
 
     def __post_init__(self) -> None:
-        self._thread = threading.Thread(target=self._beat_on, daemon=True, name=f"lease {self.folder.name}")
+        self._thread = threading.Thread(target=self._write_heartbeats, daemon=True, name=f"lease {self.folder.name}")
         self._thread.start()
 
     @property
@@ -82,7 +82,7 @@ class Lease:
             LeaseLostError: somebody else has taken over.
         """
         if _file(self.folder, self.number + 1).exists() or not self.path.exists():
-            raise LeaseLostError(f"{self.folder}: {named(read_lease(self.folder))} has taken over")
+            raise LeaseLostError(f"{self.folder}: {describe_holder(read_lease(self.folder))} has taken over")
 
     def release(self) -> None:
         """Let go: whoever comes next need not wait."""
@@ -90,23 +90,23 @@ class Lease:
         self._thread.join()
         self._write(released=True)
 
-    def _beat_on(self) -> None:
+    def _write_heartbeats(self) -> None:
         while not self._ended.wait(self.lease_s / _BEATS_PER_LEASE):
             self._write()
 
     def _write(self, **facts: Any) -> None:
         with self._writing:
-            self._beats += 1
-            text = json.dumps(_facts() | {"beat": self._beats} | self.news | facts)
+            self._heartbeats += 1
+            text = json.dumps(_facts() | {"heartbeat": self._heartbeats} | self.progress | facts)
             try:
-                with whole(self.path) as partial:
+                with atomic(self.path) as partial:
                     partial.write_text(text, encoding="utf-8")
             except OSError:  # a full disk, a server that is away: others may take over, and `check` then tells
                 return
 
 
 class Leases:
-    """Claims leases, and remembers the beats that it has seen of others."""
+    """Claims leases, and remembers the heartbeats that it has seen of others."""
 
     def __init__(self, lease_s: float = LEASE_S) -> None:
         self.lease_s = lease_s
@@ -120,13 +120,13 @@ class Leases:
         folder.mkdir(parents=True, exist_ok=True)
         try:
             with _file(folder, latest + 1).open("x", encoding="utf-8") as file:
-                file.write(json.dumps(_facts() | {"beat": 0}))
+                file.write(json.dumps(_facts() | {"heartbeat": 0}))
         except FileExistsError:
             return None
         return Lease(folder, latest + 1, self.lease_s)
 
     def holder(self, folder: Path) -> dict[str, Any] | None:
-        """Who holds a folder, as far as this process can tell by now; ``None`` if nobody does."""
+        """AgentIds holds a folder, as far as this process can tell by now; ``None`` if nobody does."""
         latest = _latest(folder)
         if not latest:
             return None
@@ -140,7 +140,7 @@ class Leases:
         if content != before:
             self._seen[path] = (content, now)
             since = now
-        holder = read_facts(path)
+        holder = read_json_or_empty(path)
         dead = _is_known_dead(holder) or holder.get("released") or now - since > self.lease_s
         return None if dead else holder
 
@@ -161,8 +161,8 @@ class Leases:
             if holder is None:
                 continue
             first = holder if first is None else first
-            if holder.get("machine") == this_machine() or holder.get("beat") != first.get("beat"):
-                raise StudyError(f"{of}: {named(holder)} is at work in it{more}")
+            if holder.get("machine") == this_machine() or holder.get("heartbeat") != first.get("heartbeat"):
+                raise StudyError(f"{of}: {describe_holder(holder)} is at work in it{more}")
             time.sleep(min(1.0, self.lease_s / 4))
         return lease
 
@@ -204,9 +204,9 @@ def _latest(folder: Path) -> int:
 def read_lease(folder: Path) -> dict[str, Any]:
     """What the latest claim's file says, whether it still holds or not; empty if there is none."""
     latest = _latest(folder)
-    return read_facts(_file(folder, latest)) if latest else {}
+    return read_json_or_empty(_file(folder, latest)) if latest else {}
 
 
-def is_quiet(lease: dict[str, Any], lease_s: float) -> bool:
+def is_stale(lease: dict[str, Any], lease_s: float) -> bool:
     """Whether the holder is gone, as far as one look can tell: for display, by the clocks of both machines."""
     return bool(_is_known_dead(lease) or lease.get("released") or time.time() - lease.get("at", 0) > lease_s)

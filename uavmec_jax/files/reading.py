@@ -21,7 +21,7 @@ def read_text(path: Path, error: type[UserError], encoding: str = "utf-8") -> st
         raise error(f"{path}: cannot be read: {reason}") from None
 
 
-def read_facts(path: Path) -> dict[str, Any]:
+def read_json_or_empty(path: Path) -> dict[str, Any]:
     """What a small JSON file says that others may just be writing; nothing if it is not there, or damaged."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))

@@ -1,24 +1,51 @@
-"""Settings in files: strict models made from the dataclasses that declare them, and one clear line for what does not fit."""
+"""Settings from files, checked: strict models, and one clear line for the first value that does not fit."""
 
 import dataclasses
 import difflib
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal, get_args
 
 import pydantic
-from pydantic import BaseModel, ConfigDict, Field, create_model
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, create_model
+
+from_array = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
+"""For fields that are tuples: TOML and JSON know arrays only, and strict models do not convert them."""
+
+Range = Annotated[tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]], from_array]
+"""``[low, high]``."""
+
+_BOUNDS = ("gt", "ge", "lt", "le")
+_TYPE_TAGS = ("int", "str", "float", "bool")
+"""What pydantic adds to the location of an error in a union."""
 
 
-class Strict(BaseModel):
-    """No unknown keys, no coercion between types, no NaN or infinity unless a field allows it."""
+class StrictModel(BaseModel):
+    """A model without unknown keys and without coercion between types; NaN and infinity only where a field allows them."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
+def model_from_dataclasses(name: str, *declarations: type, leave_out: tuple[str, ...] = ()) -> Any:
+    """Make a strict model with the fields, defaults and bounds that dataclasses declare.
+
+    Args:
+        name: of the model.
+        declarations: dataclasses; the metadata of a field may hold ``gt``, ``ge``, ``lt``, ``le`` or ``choices``.
+        leave_out: fields that files do not set.
+    """
+    fields = {
+        field.name: _field(field)
+        for declaration in declarations
+        for field in dataclasses.fields(declaration)
+        if field.name not in leave_out
+    }
+    return create_model(name, __base__=StrictModel, **fields)
+
+
 def _field(field: dataclasses.Field) -> Any:
-    """Type and bounds of one setting, from its default and its metadata."""
-    default, bounds = field.default, {k: v for k, v in field.metadata.items() if k in ("gt", "ge", "lt", "le")}
+    """Type, bounds and default of one setting."""
+    default, bounds = field.default, {k: v for k, v in field.metadata.items() if k in _BOUNDS}
     if "choices" in field.metadata:
         return Literal[field.metadata["choices"]], default
     if isinstance(default, bool):
@@ -26,58 +53,64 @@ def _field(field: dataclasses.Field) -> Any:
     if isinstance(default, int):
         return Annotated[int, Field(**{"ge": 0, **bounds})], default
     if isinstance(default, float):
-        infinite = math.isinf(default)
-        return Annotated[
-            float, Field(**{**({"ge": 0} if not bounds else {}), **bounds}, allow_inf_nan=infinite)
-        ], default
-    if field.name == "hidden":
-        return tuple[Annotated[int, Field(ge=1, le=4096)], ...], default
-    return tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]], default
+        bounds = bounds or {"ge": 0}
+        return Annotated[float, Field(**bounds, allow_inf_nan=math.isinf(default))], default
+    if "items" in field.metadata:  # a tuple of any length
+        return Annotated[tuple[Annotated[int, Field(**field.metadata["items"])], ...], from_array], default
+    return Range, default
 
 
-def settings_model(name: str, *declarations: type, leave_out: tuple[str, ...] = ()) -> Any:
-    """A strict model with the fields, defaults and bounds of pytree dataclasses."""
-    fields = {
-        field.name: _field(field)
-        for declaration in declarations
-        for field in dataclasses.fields(declaration)
-        if field.name not in leave_out
-    }
-    return create_model(name, __base__=Strict, **fields)
+def suggest(word: str, known: Iterable[str]) -> str:
+    """Suggest the nearest of the known words, or list them all."""
+    close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.4)
+    return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known)}"
 
 
-def tuples(table: Mapping[str, Any]) -> dict[str, Any]:
-    """A table of a file with its arrays as tuples, which is what the strict models want."""
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in table.items()}
-
-
-def nearest(word: str, words: Any) -> str:
-    """A hint: the nearest of the known words, or all of them."""
-    close = difflib.get_close_matches(word, list(words), n=1, cutoff=0.4)
-    return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(words)}"
-
-
-def wanted(error: Any) -> str:
-    """What would be right, from one of pydantic's errors."""
+def expectation(error: Any) -> str:
+    """Say what would be right, from one of pydantic's errors."""
     message: str = error["msg"]
     return message.replace("Input should be", "it should be").replace("Value error, ", "")
 
 
-def one_line(source: str, error: pydantic.ValidationError, root: type[BaseModel]) -> str:
-    """The first problem as one line: file, field, value, and what would be right."""
+def describe_error(source: str, error: pydantic.ValidationError, root: type[BaseModel], data: Any = None) -> str:
+    """Describe the first error in one line: file, field, value, and what would be right.
+
+    Args:
+        source: the file or option.
+        error: pydantic's.
+        root: the model that was validated.
+        data: what was validated; names the entry of a list of tables that is at fault.
+    """
     first = error.errors()[0]
-    place = ".".join(str(part) for part in first["loc"] if part not in ("int", "str", "float", "bool"))
     if first["type"] == "value_error":
-        return f"{source}: {wanted(first)}"
+        return f"{source}: {expectation(first)}"
+    entry, path = _split_location([part for part in first["loc"] if part not in _TYPE_TAGS], data)
+    place = ".".join(map(str, path))
     if first["type"] == "extra_forbidden":
-        parent: Any = root
-        for part in first["loc"][:-1]:
-            parent = parent.model_fields[part].annotation if part in getattr(parent, "model_fields", {}) else None
-            parent = next((one for one in get_args(parent) if hasattr(one, "model_fields")), parent)  # X | None
-        known = getattr(parent, "model_fields", {})
-        hint = nearest(str(first["loc"][-1]), known)
-        everything = "" if parent is root or hint.startswith("known") else f" known: {', '.join(known)}"
-        return f"{source}: {place} is not a setting; {hint}{everything}"
+        known = _fields_at(root, first["loc"][:-1])
+        hint = suggest(str(first["loc"][-1]), known)
+        everything = "" if known == root.model_fields or hint.startswith("known") else f" known: {', '.join(known)}"
+        return f"{source}: {entry}{place} is not a setting; {hint}{everything}"
     if first["type"] == "missing":
-        return f"{source}: {place} is missing"
-    return f"{source}: {place} is {first['input']!r}; {wanted(first)}"
+        return f"{source}: {entry}{place} is missing"
+    return f"{source}: {entry}{place} is {first['input']!r}; {expectation(first)}"
+
+
+def _split_location(location: list[Any], data: Any) -> tuple[str, list[Any]]:
+    """Split a location into the entry of a list of tables, counted from 1 and named, and the rest of the way."""
+    if not isinstance(data, dict) or len(location) < 2 or not isinstance(location[1], int):
+        return "", location
+    entry = data[location[0]][location[1]]
+    name = entry.get("name", "no name") if isinstance(entry, dict) else entry
+    return f"{location[0]} {location[1] + 1} ({name}): ", location[2:]
+
+
+def _fields_at(root: type[BaseModel], location: tuple[Any, ...]) -> dict[str, Any]:
+    """The fields of the model at a location."""
+    model: Any = root
+    for part in location:
+        fields = getattr(model, "model_fields", None)
+        if fields is not None:
+            model = fields[part].annotation if part in fields else None
+        model = next((one for one in get_args(model) if hasattr(one, "model_fields")), model)  # X | None, tuple[X, ...]
+    return dict(getattr(model, "model_fields", {}))

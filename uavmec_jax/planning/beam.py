@@ -57,7 +57,7 @@ class _Beam(NamedTuple):
     best: Any
 
 
-Appraisal = Callable[[Params, Layout, State], Array]
+ValueFn = Callable[[Params, Layout, State], Array]
 """``(params, layout, states [W]) -> [W]`` f32: how promising states are, all after equally many slots."""
 
 
@@ -68,11 +68,11 @@ class _Problem(NamedTuple):
     layout: Layout
     volumes: Any
     costs: SlotCosts
-    charged: Any
+    visit_share: Any
     hover: Any
     calls_from: Any
     round_m: Any
-    appraise: Appraisal | None
+    value_fn: ValueFn | None
 
 
 def horizon(params: Params, layouts: Layout) -> int:
@@ -103,7 +103,7 @@ def beam_search(
     volumes: Num[Array, "H n"],
     width: int = WIDTH,
     at_most: Any = None,
-    appraise: Appraisal | None = None,
+    value_fn: ValueFn | None = None,
 ) -> Tour:
     """The longest life that the beam finds; clairvoyant in ``volumes``.
 
@@ -113,16 +113,16 @@ def beam_search(
         volumes: bytes, the tasks of every slot; ``H`` from :func:`horizon`.
         width: states kept per slot, static.
         at_most: a lifetime that is known not to be passed; the search begins there.
-        appraise: which of the states that are not provably lost are kept, e.g. the value that a critic has learned; by
+        value_fn: which of the states that are not provably lost are kept, e.g. the value that a critic has learned; by
             default those from which the way to the aim takes the least of what is left.
     """
     costs = demand.slot_costs(params, layout, volumes)
     covers = demand.coverage(params, layout)
-    charged = demand.shares(layout, covers)
-    hover = demand.fetched_from(covers, ~layout.has_power | ~layout.has_comms)
-    calls_from = demand.fetched_from(covers, ~layout.has_comms)
-    round_m = _typical_round(layout, charged)
-    problem = _Problem(params, layout, volumes, costs, charged, hover, calls_from, round_m, appraise)
+    visit_share = demand.visit_shares(layout, covers)
+    hover = demand.best_hover_point(covers, ~layout.has_power | ~layout.has_comms)
+    calls_from = demand.best_hover_point(covers, ~layout.has_comms)
+    round_m = _typical_round(layout, visit_share)
+    problem = _Problem(params, layout, volumes, costs, visit_share, hover, calls_from, round_m, value_fn)
     aim = counting_bound(params, layout, costs)
     aim = aim if at_most is None else jnp.minimum(aim, at_most)
 
@@ -143,7 +143,7 @@ def counting_bound(params: Params, layout: Layout, costs: SlotCosts) -> Int[Arra
     A life of k slots means that k - 1 slots were survived and that the UAV could pay for k.
     """
     state = initial_state(params, layout)
-    charged = demand.shares(layout, demand.coverage(params, layout))
+    visit_share = demand.visit_shares(layout, demand.coverage(params, layout))
     slots = costs.work.shape[0]
     base, extra = demand.flight_power(params)
     first_hop = jnp.min(jnp.linalg.norm(layout.position, axis=-1)) / params.uav_speed_m_s
@@ -158,8 +158,8 @@ def counting_bound(params: Params, layout: Layout, costs: SlotCosts) -> Int[Arra
         return (
             affordable
             & ~jnp.any(hopeless)
-            & (jnp.sum(charged * jnp.maximum(whole, fresh)) <= life - 1 + 1e-3)
-            & ~demand.overdue(params, layout, charged, state.age, life - 1)
+            & (jnp.sum(visit_share * jnp.maximum(whole, fresh)) <= life - 1 + 1e-3)
+            & ~demand.overdue(params, layout, visit_share, state.age, life - 1)
         )
 
     lives = jnp.arange(1, slots + 1)
@@ -167,13 +167,13 @@ def counting_bound(params: Params, layout: Layout, costs: SlotCosts) -> Int[Arra
     return jnp.minimum(best, params.max_slots).astype(jnp.int32)
 
 
-def _typical_round(layout: Layout, charged: Float[Array, " n"]) -> Float[Array, ""]:
+def _typical_round(layout: Layout, visit_share: Float[Array, " n"]) -> Float[Array, ""]:
     """Metres that one round through the devices without communication takes, guessed from nearest neighbours."""
     calls = ~layout.has_comms
     ground = jnp.linalg.norm(layout.position[:, None] - layout.position[None], axis=-1)
     apart = calls[:, None] & calls & ~jnp.eye(calls.shape[0], dtype=bool)
     nearest = jnp.min(jnp.where(apart, ground, jnp.inf), axis=1)
-    return jnp.sum(jnp.where(calls & jnp.isfinite(nearest), nearest * charged, 0.0))
+    return jnp.sum(jnp.where(calls & jnp.isfinite(nearest), nearest * visit_share, 0.0))
 
 
 def _search(problem: _Problem, aim: Int[Array, ""], width: int) -> _Beam:
@@ -234,7 +234,7 @@ def _promise(problem: _Problem, slot: Array, aim: Array, states: State) -> Float
     Minus infinity where the aim is provably out of reach: too many visits are needed, data would expire, the energy
     does not last.
     """
-    params, layout, charged = problem.params, problem.layout, problem.charged
+    params, layout, visit_share = problem.params, problem.layout, problem.visit_share
     left = aim - 1 - slot
     asked = demand.battery_demand(layout, problem.costs, slot, aim - 1)
     whole, part, hopeless = demand.battery_visits(layout, asked, states.battery)
@@ -250,14 +250,14 @@ def _promise(problem: _Problem, slot: Array, aim: Array, states: State) -> Float
 
     lost = (
         jnp.any(hopeless, axis=-1)
-        | (need @ charged > left + 1e-3)
-        | demand.overdue(params, layout, charged, states.age, left)
+        | (need @ visit_share > left + 1e-3)
+        | demand.overdue(params, layout, visit_share, states.age, left)
         | (spare < 0.0)
     )
-    if problem.appraise is not None:
-        return jnp.where(lost & (left >= 0), -jnp.inf, problem.appraise(params, layout, states))
+    if problem.value_fn is not None:
+        return jnp.where(lost & (left >= 0), -jnp.inf, problem.value_fn(params, layout, states))
     # Devices that are served from one hover point share their visits.
-    visits = jnp.sum(jnp.maximum(demand.most_by_place(problem.hover, need + smooth), 0.0), axis=-1)
+    visits = jnp.sum(jnp.maximum(demand.max_by_hover_point(problem.hover, need + smooth), 0.0), axis=-1)
     pressure = 0.5 * visits / jnp.maximum(left, 1) + flights / jnp.maximum(spare, 1.0)
     pressure += jnp.where(_bunched(problem, states.age, left), _BUNCHED, 0.0)
     return jnp.where(lost & (left >= 0), -jnp.inf, -pressure)
@@ -267,7 +267,7 @@ def _bunched(problem: _Problem, age: Int[Array, "W n"], left: Array) -> Bool[Arr
     """Whether the data cannot all be fetched in time, each from its usual hover point: likely, but no proof."""
     due = slots_to_expiry(problem.params) - age
     due = jnp.where(~problem.layout.has_comms & (due <= left), due, demand.NEVER)
-    first = -demand.most_by_place(problem.calls_from, -due)
+    first = -demand.max_by_hover_point(problem.calls_from, -due)
     load = demand.load_by_due(first, jnp.ones(first.shape[-1]))
     return jnp.any((first < demand.NEVER) & (load > first), axis=-1)
 

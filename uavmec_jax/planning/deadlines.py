@@ -35,7 +35,7 @@ def earliest_deadline(params: Params, layout: Layout, state: State, key: PRNGKey
     """
     covers = demand.coverage(params, layout)
     mean = demand.mean_slot(params, layout)
-    slots, services = hoped_for(params, layout, state, mean, demand.shares(layout, covers))
+    slots, services = feasible_horizon(params, layout, state, mean, demand.visit_shares(layout, covers))
 
     away = jnp.linalg.norm(layout.position - state.uav_position, axis=-1)
     due = _due(params, layout, state, covers, slots)
@@ -56,14 +56,14 @@ def _due(params: Params, layout: Layout, state: State, covers: Bool[Array, "n n"
     share a visit always do, and share their deadline.
     """
     calls = ~layout.has_comms
-    hover = demand.fetched_from(covers, calls)
+    hover = demand.best_hover_point(covers, calls)
     left = (slots_to_expiry(params) - state.age).astype(jnp.float32)
     left = jnp.where(calls & (left <= slots), left, demand.NEVER)
     return jnp.min(jnp.where(hover == jnp.arange(hover.shape[0])[:, None], left, demand.NEVER), axis=1)
 
 
-def hoped_for(
-    params: Params, layout: Layout, state: State, mean: SlotCosts, charged: Float[Array, " n"]
+def feasible_horizon(
+    params: Params, layout: Layout, state: State, mean: SlotCosts, visit_share: Float[Array, " n"]
 ) -> tuple[Any, Float[Array, " n"]]:
     """Slots that may still be survived, and the services that each battery then needs.
 
@@ -72,7 +72,7 @@ def hoped_for(
         layout: the devices.
         state: before the slot.
         mean: the slot to expect, from :func:`demand.mean_slot`.
-        charged: share of a visit that each device is charged with, from :func:`demand.shares`.
+        visit_share: share of a visit that each device is visit_share with, from :func:`demand.visit_shares`.
     """
     shortest = jnp.min(mean.duration)
     drain = demand.idle_drain(layout, mean)
@@ -86,7 +86,7 @@ def hoped_for(
     def fits(slots: Array) -> Array:
         fresh, _ = demand.age_visits(params, layout, state.age, slots)
         need = jnp.maximum(services(slots), fresh)
-        return (need @ charged <= slots) & jnp.all(need <= slots) & (slots * base * shortest <= state.uav_energy)
+        return (need @ visit_share <= slots) & jnp.all(need <= slots) & (slots * base * shortest <= state.uav_energy)
 
     # Bisection: what fits into a number of slots fits into fewer.
     def halve(step: Any, slots: Array) -> Array:

@@ -47,11 +47,11 @@ def _slant(params: Params, layout: Layout) -> Float[Array, "n n"]:
     return jnp.sqrt(jnp.sum(ground**2, axis=-1) + params.uav_altitude_m**2)
 
 
-def shares(layout: Layout, covers: Bool[Array, "n n"]) -> Float[Array, " n"]:
-    """Share of a visit that each device is charged with; no hover point's devices are charged more than one visit.
+def visit_shares(layout: Layout, covers: Bool[Array, "n n"]) -> Float[Array, " n"]:
+    """Share of a visit that each device is visit_share with; no hover point's devices are visit_share more than one visit.
 
-    1 for a needy device that nobody shares a hover point with, 0 for one that has power and communication. Whatever the
-    UAV does, the charged shares of the devices served in one slot sum to at most 1, so ``sum(shares * visits needed)``
+    1 for a needy device that nobody visit_shares a hover point with, 0 for one that has power and communication. Whatever the
+    UAV does, the visit_share visit_shares of the devices served in one slot sum to at most 1, so ``sum(visit_shares * visits needed)``
     is a lower bound on the slots a demand takes (it is a feasible dual of the covering problem).
     """
     needy = ~layout.has_power | ~layout.has_comms
@@ -60,7 +60,7 @@ def shares(layout: Layout, covers: Bool[Array, "n n"]) -> Float[Array, " n"]:
     return jnp.where(needy, 1.0 / most, 0.0)
 
 
-def fetched_from(covers: Bool[Array, "n n"], these: Bool[Array, " n"]) -> Int[Array, " n"]:
+def best_hover_point(covers: Bool[Array, "n n"], these: Bool[Array, " n"]) -> Int[Array, " n"]:
     """The hover point from which each device is best served: the one that serves most of ``these``."""
     together = jnp.sum(covers & these, axis=1)
     return jnp.argmax(jnp.where(covers, together[:, None], -1), axis=0)
@@ -159,27 +159,27 @@ def age_visits(
 
 
 def overdue(
-    params: Params, layout: Layout, charged: Float[Array, " n"], age: Int[Array, "*B n"], slots: Any
+    params: Params, layout: Layout, visit_share: Float[Array, " n"], age: Int[Array, "*B n"], slots: Any
 ) -> Bool[Array, "*B"]:
     """Whether the data that expire within ``slots`` more slots can no longer all be fetched in time.
 
-    Earliest-deadline test: for every due date, the charged visits due by then must fit into the slots until then.
+    Earliest-deadline test: for every due date, the visit_share visits due by then must fit into the slots until then.
     """
     due = slots_to_expiry(params) - age
     matters = ~layout.has_comms & (due <= slots)
-    load = load_by_due(jnp.where(matters, due, jnp.iinfo(jnp.int32).max), charged)
+    load = load_by_due(jnp.where(matters, due, jnp.iinfo(jnp.int32).max), visit_share)
     return jnp.any(matters & (load > due + _ROUNDING * 10), axis=-1)
 
 
-def load_by_due(due: Num[Array, "*B n"], charged: Float[Array, " n"]) -> Float[Array, "*B n"]:
+def load_by_due(due: Num[Array, "*B n"], visit_share: Float[Array, " n"]) -> Float[Array, "*B n"]:
     """Charged visits that fall due no later than each entry's own due date."""
     # Entries in rows and one against all at a time: the batch stays the innermost axis, which is what a CPU is fast at.
     rows = jnp.moveaxis(due, -1, 0)
-    add = lambda entry, load: load + jnp.where(rows[entry] <= rows, charged[entry], 0.0)  # noqa: E731
+    add = lambda entry, load: load + jnp.where(rows[entry] <= rows, visit_share[entry], 0.0)  # noqa: E731
     return jnp.moveaxis(jax.lax.fori_loop(0, rows.shape[0], add, jnp.zeros(rows.shape)), 0, -1)
 
 
-def most_by_place(place: Int[Array, " n"], value: Num[Array, "*B n"]) -> Num[Array, "*B n"]:
+def max_by_hover_point(place: Int[Array, " n"], value: Num[Array, "*B n"]) -> Num[Array, "*B n"]:
     """The largest value of the devices that belong to each place; minus :data:`NEVER` where none does."""
     rows = jnp.moveaxis(value, -1, 0)
     lowest = jnp.full(rows.shape, -NEVER, rows.dtype)

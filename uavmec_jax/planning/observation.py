@@ -13,7 +13,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from uavmec_jax.env.dynamics import State, slots_to_expiry
-from uavmec_jax.env.fixed_point import sum_in_any_order
+from uavmec_jax.env.fixed_point import order_independent_sum
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.planning import deadlines, demand
@@ -93,7 +93,7 @@ def observe_devices(params: Params, layout: Layout, state: State) -> Observation
     mask = jnp.ones(n, bool) if layout.present is None else layout.present
     count = jnp.sum(mask).astype(jnp.float32)
     known = _Known.of(params, layout)
-    slots, services = deadlines.hoped_for(params, layout, state, known.mean, known.charged)
+    slots, services = deadlines.feasible_horizon(params, layout, state, known.mean, known.visit_share)
     everyone = _globals(params, layout, state, known, slots, services, count)
     own = _own(params, layout, state, known, slots, services, mask)
     features = jnp.concatenate([own, jnp.broadcast_to(everyone, (n, everyone.shape[0]))], axis=-1)
@@ -105,7 +105,7 @@ class _Known(NamedTuple):
 
     mean: Any
     covers: Any
-    charged: Any
+    visit_share: Any
     drain: Any
     use: Any
 
@@ -119,8 +119,8 @@ class _Known(NamedTuple):
         return cls(
             mean=mean,
             covers=covers,
-            # In steps of 2**-16 sums of shares are exact, so they do not depend on the order of the devices.
-            charged=jnp.floor(demand.shares(layout, covers) * 65536.0) / 65536.0,
+            # In steps of 2**-16 sums of visit_shares are exact, so they do not depend on the order of the devices.
+            visit_share=jnp.floor(demand.visit_shares(layout, covers) * 65536.0) / 65536.0,
             drain=demand.idle_drain(layout, mean),
             use=use,
         )
@@ -139,7 +139,7 @@ def _own(
     saving = jnp.maximum(mean.work - mean.upload, 0.0)
     missing = (slots * known.drain - state.battery) / jnp.maximum(saving, 1e-3)
     due = _due(params, layout, state.age)
-    load = demand.load_by_due(due, known.charged)
+    load = demand.load_by_due(due, known.visit_share)
     empties = jnp.where(services > 0, state.battery / jnp.maximum(known.drain, 1e-6), jnp.inf)
     t_fly = jnp.linalg.norm(layout.position - state.uav_position, axis=-1) / params.uav_speed_m_s
     base, extra = demand.flight_power(params)
@@ -191,9 +191,9 @@ def _after(params: Params, layout: Layout, state: State, known: _Known, slots: A
     missing = (left * known.drain - battery) / saving
     services = jnp.where(layout.has_power, 0.0, jnp.maximum(missing, 0.0))
     turns, _ = demand.age_visits(params, layout, age, left)
-    spare = left - sum_in_any_order(jnp.maximum(services, turns) * known.charged)
+    spare = left - order_independent_sum(jnp.maximum(services, turns) * known.visit_share)
     due = _due(params, layout, age)
-    load = demand.load_by_due(due, known.charged)
+    load = demand.load_by_due(due, known.visit_share)
     tight = jnp.max(jnp.where(due < demand.NEVER, load - due, -2.0 * 64), axis=-1)
     return spare, tight
 
@@ -205,10 +205,10 @@ def _globals(
     base, _ = demand.flight_power(params)
     uav_slots = state.uav_energy / jnp.maximum(base * jnp.min(known.mean.duration), 1e-3)
     fresh, _ = demand.age_visits(params, layout, state.age, slots)
-    needed = sum_in_any_order(jnp.maximum(services, fresh) * known.charged)
+    needed = order_independent_sum(jnp.maximum(services, fresh) * known.visit_share)
     due = _due(params, layout, state.age)
     falls_due = due <= slots
-    load = demand.load_by_due(jnp.where(falls_due, due, demand.NEVER), known.charged)
+    load = demand.load_by_due(jnp.where(falls_due, due, demand.NEVER), known.visit_share)
     return jnp.stack(
         [
             slots / _LONG,

@@ -12,8 +12,8 @@ from jaxtyping import Array, Key
 
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
-from uavmec_jax.env.rollout import Episode, Policy, recorded, rollout, rollouts, tour_policy, volume_table
-from uavmec_jax.planning.beam import Appraisal, beam_search
+from uavmec_jax.env.rollout import Episode, Policy, rollout, rollout_with_actions, rollouts, tour_policy, volume_table
+from uavmec_jax.planning.beam import ValueFn, beam_search
 from uavmec_jax.planning.bound import upper_bounds
 from uavmec_jax.planning.deadlines import earliest_deadline
 from uavmec_jax.planning.heuristics import HEURISTICS
@@ -26,15 +26,15 @@ _ACCELERATOR_BATCH = 256
 """Scenarios planned for at once on an accelerator. A CPU core takes one at a time and keeps it in its cache."""
 
 
-@partial(jax.jit, static_argnames=("slots", "width", "appraise"))
-def play_beam(
+@partial(jax.jit, static_argnames=("slots", "width", "value_fn"))
+def beam_episodes(
     params: Params,
     layouts: Layout,
     keys: Key[Array, " B"],
     *,
     slots: int,
     width: int,
-    appraise: Appraisal | None = None,
+    value_fn: ValueFn | None = None,
 ) -> tuple[Any, Episode]:
     """The beam's tour for each of ``B`` scenarios, and the episode that it makes; clairvoyant.
 
@@ -44,19 +44,19 @@ def play_beam(
         keys: volume draws.
         slots: from :func:`uavmec_jax.planning.beam.horizon`.
         width: states kept per slot.
-        appraise: see :func:`beam_search`.
+        value_fn: see :func:`beam_search`.
     """
 
     def one(params: Params, layout: Layout, key: Key[Array, ""]) -> tuple[Array, Episode]:
         volumes = volume_table(params, layout.capacity.shape[0], key, slots)
-        plan = beam_search(params, layout, volumes, width, appraise=appraise)
+        plan = beam_search(params, layout, volumes, width, value_fn=value_fn)
         return plan.actions, rollout(tour_policy(plan.actions), params, layout, key)
 
     return spread(one, params, layouts, keys)
 
 
 @partial(jax.jit, static_argnames=("slots", "samples", "base"))
-def play_rollout(
+def rollout_planner_episodes(
     params: Params,
     layouts: Layout,
     keys: Key[Array, " B"],
@@ -65,19 +65,19 @@ def play_rollout(
     samples: int,
     base: Policy = earliest_deadline,
 ) -> tuple[Any, Episode]:
-    """The rollout planner's tour for each scenario, and its episode; see :func:`rollout_planner` and :func:`play_beam`."""
-    return spread(partial(recorded, rollout_planner(base, samples), slots=slots), params, layouts, keys)
+    """The rollout planner's tour for each scenario, and its episode; see :func:`rollout_planner` and :func:`beam_episodes`."""
+    return spread(partial(rollout_with_actions, rollout_planner(base, samples), slots=slots), params, layouts, keys)
 
 
 @partial(jax.jit, static_argnames="policy")
-def play_policy(policy: Policy, params: Params, layouts: Layout, keys: Key[Array, "B D"]) -> Episode:
+def policy_episodes(policy: Policy, params: Params, layouts: Layout, keys: Key[Array, "B D"]) -> Episode:
     """Episodes ``[B, D]`` of any policy, ``B`` scenarios with ``D`` volume draws each, a batch of them at a time."""
     one = lambda params, layout, keys: rollouts(policy, params, layout, keys)  # noqa: E731
     return spread(one, params, layouts, keys, batch=_CPU_BATCH)
 
 
 @partial(jax.jit, static_argnames="names")
-def play_heuristics(names: tuple[str, ...], params: Params, layouts: Layout, keys: Key[Array, "B D"]) -> Episode:
+def heuristic_episodes(names: tuple[str, ...], params: Params, layouts: Layout, keys: Key[Array, "B D"]) -> Episode:
     """Episodes ``[K, B, D]`` of ``K`` heuristics: one after the other through one compiled slot."""
 
     def play(index: Array) -> Episode:
@@ -89,7 +89,7 @@ def play_heuristics(names: tuple[str, ...], params: Params, layouts: Layout, key
     return jax.lax.map(play, jnp.arange(len(names)))
 
 
-def bound_all(
+def bound_scenarios(
     params: Params, layouts: Layout, keys: Key[Array, " B"], at_least: np.ndarray, *, slots: int
 ) -> np.ndarray:
     """Upper bounds ``[B]`` int32 of ``B`` scenarios; ``at_least [B]`` are lifetimes that were reached."""

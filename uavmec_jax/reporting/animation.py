@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Policy, Trace, trace
-from uavmec_jax.files.writing import whole
+from uavmec_jax.files.writing import atomic
 from uavmec_jax.reporting.canvas import new_figure
 from uavmec_jax.reporting.road_map import density_key, draw_roads, draw_sites, frame
 from uavmec_jax.traffic.evacuation import Evacuation
@@ -29,7 +29,7 @@ def save_animation(
     """Draw the episode that a policy plays, a frame for each slot; how many slots it lasted.
 
     Args:
-        path: a ``.gif``; written whole or not at all.
+        path: a ``.gif``; written atomic or not at all.
         evacuation: the roads and their densities.
         params: scenario parameters.
         layout: the devices, where the evacuation has them.
@@ -41,7 +41,7 @@ def save_animation(
     slots = int(told.played.sum())
     figure = new_figure(9.6, 6.2)
     writer = PillowWriter(fps=_FRAMES_PER_S)
-    with whole(path) as partial, writer.saving(figure, str(partial), dpi=80):
+    with atomic(path) as partial, writer.saving(figure, str(partial), dpi=80):
         for slot in range(slots):
             figure.clear()
             _draw_slot(figure, evacuation, params, layout, told, slot, title)

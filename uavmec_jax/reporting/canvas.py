@@ -1,16 +1,16 @@
-"""Figures without a display, written whole or not at all."""
+"""Figures without a display, written atomic or not at all."""
 
 from pathlib import Path
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from uavmec_jax.files.writing import whole
+from uavmec_jax.files.writing import atomic
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure, whole or not at all; the ending says the format."""
-    with whole(path) as partial:
+    """Write a figure, atomic or not at all; the ending says the format."""
+    with atomic(path) as partial:
         figure.savefig(partial, dpi=144, metadata={"Software": None} if path.suffix == ".png" else None)
 
 

@@ -7,7 +7,7 @@ import pandas as pd
 from rich.table import Table
 from rich.text import Text
 
-from uavmec_jax.reporting.formatting import first_to_fail, half_interval, place
+from uavmec_jax.reporting.formatting import axis_values, first_to_fail, half_interval
 from uavmec_jax.studies.compare import Side, differences, overall, pair
 
 _MEASURES = {
@@ -25,17 +25,17 @@ def comparison(a: Side, b: Side) -> tuple[dict[str, Table], dict[str, Any]]:
         StudyError: the runs have nothing to compare.
     """
     both, axes = pair(a, b)
-    cells, whole = differences(both, axes), overall(both, axes)
+    cells, atomic = differences(both, axes), overall(both, axes)
     titles = {
         f"Lifetime in slots, seed by seed. A: {a.name}; B: {b.name}": _cells(cells, axes),
-        f"Over all {len(cells)} cells, {len(both)} pairs": _whole(whole),
+        f"Over all {len(cells)} cells, {len(both)} pairs": _whole(atomic),
     }
     data = {
         "a": a.name,
         "b": b.name,
         "pairs": len(both),
         "cells": json.loads(cells.to_json(orient="records")),
-        "overall": {name: dict(zip(("value", "low", "high"), one, strict=True)) for name, one in whole.items()},
+        "overall": {name: dict(zip(("value", "low", "high"), one, strict=True)) for name, one in atomic.items()},
     }
     return titles, data
 
@@ -48,16 +48,16 @@ def _cells(cells: pd.DataFrame, axes: list[str]) -> Table:
         style = "green" if cell["low"] > 0 else "red" if cell["high"] < 0 else "default"
         difference = Text(f"{cell['difference']:+.2f}", style=style)
         difference.append(half_interval(cell["low"], cell["high"]), style="dim")
-        table.add_row(*place(cell, (*axes, "seeds")), f"{cell['a']:.2f}", f"{cell['b']:.2f}", difference)
+        table.add_row(*axis_values(cell, (*axes, "seeds")), f"{cell['a']:.2f}", f"{cell['b']:.2f}", difference)
     return table
 
 
-def _whole(whole: dict[str, tuple[float, float, float]]) -> Table:
+def _whole(atomic: dict[str, tuple[float, float, float]]) -> Table:
     table = Table()
     for name, justify in (("measure", "left"), ("value", "right"), ("95 %", "right")):
         table.add_column(name, justify=justify)  # type: ignore[arg-type]
     for name, words in _MEASURES.items():
-        value, low, high = whole[name]
+        value, low, high = atomic[name]
         table.add_row(words, f"{value:.3f}", f"{low:.3f} to {high:.3f}" if low == low else "-")
     return table
 

@@ -128,7 +128,7 @@ def curves_figure(results: Results) -> Figure:
     left, right = figure.subplots(1, 2, sharey=True)
     pairs = (
         (left, "chunk_steps", "episode_length", "while training"),
-        (right, "look_steps", "validation", "greedy policy"),
+        (right, "validation_steps", "validation", "greedy policy"),
     )
     alone = len(results.curves) == 1
     for axis, steps, values, title in pairs:

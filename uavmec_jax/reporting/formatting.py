@@ -9,7 +9,7 @@ def half_interval(low: float, high: float) -> str:
     return f" ±{(high - low) / 2:.1f}" if high == high else " ±?"
 
 
-def place(cell: Any, axes: Iterable[str]) -> list[str]:
+def axis_values(cell: Any, axes: Iterable[str]) -> list[str]:
     """The values of a cell on some axes; numbers without trailing zeros."""
     return [value if isinstance(value := cell[name], str) else f"{value:g}" for name in axes]
 

@@ -4,18 +4,18 @@ from typing import Any
 
 import numpy as np
 
-from uavmec_jax.planning.plan import Outlook
-from uavmec_jax.scenarios.named_scenario import Inventory
+from uavmec_jax.planning.plan import Plan
+from uavmec_jax.scenarios.named_scenario import NamedScenario
 
 
-def plan_geojson(inventory: Inventory, outlook: Outlook) -> dict[str, Any]:
+def tour_geojson(scenario: NamedScenario, plan: Plan) -> dict[str, Any]:
     """A feature collection; longitude and latitude in degrees.
 
     Raises:
-        LayoutError: the inventory has no place on the map.
+        ScenarioError: the scenario has no place on the map.
     """
-    devices = inventory.geographic(outlook.layout.position)
-    visits = {name: np.bincount(route.action, minlength=len(devices)) for name, route in outlook.routes.items()}
+    devices = scenario.geographic(plan.layout.position)
+    visits = {name: np.bincount(tour.action, minlength=len(devices)) for name, tour in plan.tours.items()}
     points = [
         _feature(
             "Point",
@@ -23,22 +23,22 @@ def plan_geojson(inventory: Inventory, outlook: Outlook) -> dict[str, Any]:
             {
                 "number": i + 1,
                 "name": name,
-                "power": bool(outlook.layout.has_power[i]),
-                "comms": bool(outlook.layout.has_comms[i]),
-                "fails_first_share": float(outlook.first_failure[i]),
+                "power": bool(plan.layout.has_power[i]),
+                "comms": bool(plan.layout.has_comms[i]),
+                "fails_first_share": float(plan.forecast.first_failure[i]),
                 **{f"visits_{tour}": int(count[i]) for tour, count in visits.items()},
             },
         )
-        for i, name in enumerate(inventory.names)
+        for i, name in enumerate(scenario.device_names)
     ]
     lines = []
-    for name, route in outlook.routes.items():
-        stops = np.concatenate([np.zeros((1, 2)), outlook.layout.position[route.action]])
+    for name, tour in plan.tours.items():
+        stops = np.concatenate([np.zeros((1, 2)), plan.layout.position[tour.action]])
         moved = np.append(True, np.any(np.diff(stops, axis=0) != 0, axis=1))
-        path = inventory.geographic(stops[moved]).tolist()
+        path = scenario.geographic(stops[moved]).tolist()
         path = path if len(path) > 1 else path * 2  # a line has at least two positions
-        lifetime = float(outlook.lifetimes[name].mean())
-        properties = {"tour": name, "devices": [int(a) + 1 for a in route.action], "mean_lifetime_slots": lifetime}
+        lifetime = float(plan.lifetimes[name].mean())
+        properties = {"tour": name, "devices": [int(a) + 1 for a in tour.action], "mean_lifetime_slots": lifetime}
         lines.append(_feature("LineString", path, properties))
     return {"type": "FeatureCollection", "features": [*points, *lines]}
 

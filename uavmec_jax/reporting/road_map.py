@@ -70,7 +70,7 @@ def density_key() -> list[Line2D]:
 
 
 def draw_map(axis: Axes, evacuation: Evacuation) -> None:
-    """The whole map: roads by their mean density, devices, key."""
+    """The atomic map: roads by their mean density, devices, key."""
     draw_roads(axis, evacuation, evacuation.mean_road_density)
     draw_sites(axis, evacuation)
     frame(axis, evacuation)

@@ -9,14 +9,14 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from uavmec_jax.reporting.canvas import new_figure
-from uavmec_jax.search.search import Found
-from uavmec_jax.search.space import own_settings
+from uavmec_jax.search.search import SearchResult
+from uavmec_jax.search.space import baseline_settings
 
 _SHOWN = 4
 """Trials in the table."""
 
 
-def search_tables(found: Found) -> dict[str, Table]:
+def search_tables(found: SearchResult) -> dict[str, Table]:
     """The best trials, and what matters, by title."""
     trials = found.trials
     done = trials[trials["state"] == "complete"].sort_values("value", ascending=False).head(_SHOWN)
@@ -25,7 +25,7 @@ def search_tables(found: Found) -> dict[str, Table]:
     for name in ("setting", "study", *(f"trial {number}" for number in done["number"])):
         best.add_column(name, justify="left" if name == "setting" else "right")
     best.add_row("slots", "", *(f"{value:.2f}" for value in done["value"]), end_section=True)
-    for name, own in own_settings(found.space).items():
+    for name, own in baseline_settings(found.space).items():
         best.add_row(name, _short(own), *(_short(value) for value in done[name]))
     importance = Table()
     importance.add_column("setting")
@@ -44,7 +44,7 @@ def _short(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def history_figure(found: Found) -> Figure:
+def history_figure(found: SearchResult) -> Figure:
     """The objective trial by trial, those given up as crosses, and the best so far."""
     trials, figure = found.trials, new_figure(7.0, 4.0)
     axis = figure.add_subplot()
@@ -58,7 +58,7 @@ def history_figure(found: Found) -> Figure:
     return figure
 
 
-def importance_figure(found: Found) -> Figure:
+def importance_figure(found: SearchResult) -> Figure:
     """What the objective hangs on, and where along each setting the good trials are."""
     names = list(found.importance) or list(found.space.space)
     figure = new_figure(9.0, 0.5 + 1.6 * len(names))
@@ -87,7 +87,7 @@ def _positions(values: pd.Series) -> tuple[np.ndarray, list[str] | None]:
     return values.astype(str).map(labels.index).to_numpy(), labels
 
 
-def search_json(found: Found) -> dict[str, Any]:
+def search_json(found: SearchResult) -> dict[str, Any]:
     """What a program may read."""
     return {
         "space": found.space.model_dump(mode="json"),

@@ -11,11 +11,11 @@ _MOST = 8
 def status_lines(status: Status) -> list[str]:
     """What stands in ``uavmec status``."""
     states = ", ".join(f"{count:,} {state}" for state, count in status.shards.items() if count)
-    share = status.steps / max(status.of_steps, 1)
+    share = status.steps / max(status.total_steps, 1)
     lines = [
         f"{status.directory}: {'complete' if status.complete else 'not complete'}, {status.agents:,} agents",
         f"shards: {states}",
-        f"steps: {status.steps:,} of {status.of_steps:,} ({share:.0%})",
+        f"steps: {status.steps:,} of {status.total_steps:,} ({share:.0%})",
         f"disk: {status.disk_bytes / 2**20:,.1f} MiB",
     ]
     if status.seconds_left is not None:

@@ -1,4 +1,4 @@
-"""Who fails first in an evacuation: the paper's Table 7 and studies like it."""
+"""AgentIds fails first in an evacuation: the paper's Table 7 and studies like it."""
 
 from typing import Any
 
@@ -6,12 +6,13 @@ import pandas as pd
 from rich.table import Table
 from rich.text import Text
 
-from uavmec_jax.reporting.formatting import half_interval, place
+from uavmec_jax.reporting.formatting import axis_values, half_interval
+from uavmec_jax.studies.axes import TRAFFIC_WEIGHTS
 from uavmec_jax.studies.first_failures import LEARNED, first_failure_groups, traffic_claims, with_traffic
 from uavmec_jax.studies.paper import TABLE7
 from uavmec_jax.studies.population import cell_axes
 from uavmec_jax.studies.results import Results
-from uavmec_jax.studies.schema import PLANNERS, TRAFFIC_WEIGHTS
+from uavmec_jax.studies.schema import PLANNERS
 
 _SHORT = {
     "oldest_first": "oldest",
@@ -62,7 +63,7 @@ def lifetimes_table(results: Results) -> Table:
         intervals = [half_interval(cell[f"{name}_low"], cell[f"{name}_high"]) for name in learned]
         means = [f"{cell[name]:.1f}{half}" for name, half in zip(learned, intervals, strict=True)]
         means += [f"{cell[name]:.1f}" for name in (*others, *planners)]
-        table.add_row(*place(cell, axes), traffic_words(cell), *means)
+        table.add_row(*axis_values(cell, axes), traffic_words(cell), *means)
     return table
 
 

@@ -6,7 +6,7 @@ import pandas as pd
 from rich.table import Table
 from rich.text import Text
 
-from uavmec_jax.reporting.formatting import first_to_fail, half_interval, place
+from uavmec_jax.reporting.formatting import axis_values, first_to_fail, half_interval
 from uavmec_jax.reporting.table6 import is_table6, table6_tables
 from uavmec_jax.reporting.table7 import table7_tables
 from uavmec_jax.studies.first_failures import has_places
@@ -36,17 +36,17 @@ def tables(results: Results) -> dict[str, Table]:
     below = f"below: paper{' / oldest-first' * ('oldest_first' in results.policies)}"
     titles: dict[str, str] = {name: f"Lifetime in slots, `{name}` weights ± 95 %; {below}" for name in trained}
     if not trained and results.shown in results.policies:
-        titles = {results.shown: f"Lifetime in slots, {spoken(results.shown)} ± 95 %; {below}"}
+        titles = {results.shown: f"Lifetime in slots, {display_name(results.shown)} ± 95 %; {below}"}
     shown = {title: grid_table(results, cells, name) for name, title in titles.items()}
     if "best_over_oldest" in cells:
         shown["Slots more than oldest-first on the same layouts ± 95 %: `best`; below: `last`"] = paired_table(cells)
     if results.gaps:
         shown[gap_title(results)] = gap_table(results, cells)
-    first = f"First to fail ({spoken(results.shown)}): device, share of held-out episodes, all seeds"
+    first = f"First to fail ({display_name(results.shown)}): device, share of held-out episodes, all seeds"
     return shown | {first: failure_table(cells, results.shown)}
 
 
-def spoken(policy: str) -> str:
+def display_name(policy: str) -> str:
     """A policy's name as people write it."""
     names = {
         "best": "best weights",
@@ -156,12 +156,12 @@ def list_table(results: Results, cells: pd.DataFrame) -> Table:
             lifetimes.append(f"{cell[policy]:.1f}{interval}")
         gaps = [f"{gap:+.1f}" for gap in gap_percent(results, cell).values()]
         failing = [] if drawn else [first_to_fail(cell[f"{results.shown}_first_device"])]
-        table.add_row(*place(cell, (*axes, "seeds")), *lifetimes, *gaps, *failing)
+        table.add_row(*axis_values(cell, (*axes, "seeds")), *lifetimes, *gaps, *failing)
     return table
 
 
 def _step(upper: str, lower: str) -> str:
-    return f"{spoken(lower)} to {spoken(upper)}"
+    return f"{display_name(lower)} to {display_name(upper)}"
 
 
 def summary(results: Results) -> list[str]:
@@ -172,7 +172,7 @@ def summary(results: Results) -> list[str]:
     if results.gaps:
         draws = results.evaluation[f"{results.gaps[0][0]}/lifetime"].shape[1]
         ladder = [results.gaps[0][1], *(upper for upper, _ in results.gaps)]
-        means = ", ".join(f"{spoken(name)} {cells[f'{name}_planned'].mean():.2f}" for name in ladder)
+        means = ", ".join(f"{display_name(name)} {cells[f'{name}_planned'].mean():.2f}" for name in ladder)
         gaps = pd.DataFrame([gap_percent(results, cell) for _, cell in cells.iterrows()])
         steps = ", ".join(
             f"{_step(*pair)} {gaps[name].mean():.1f} (most {gaps[name].max():.1f})"

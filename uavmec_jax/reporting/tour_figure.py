@@ -1,4 +1,4 @@
-"""The figure of one scenario's outlook: the map with both tours, batteries and ages over time."""
+"""The figure of one scenario's plan: the map with both tours, batteries and ages over time."""
 
 from collections.abc import Sequence
 
@@ -6,28 +6,28 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from uavmec_jax.planning.plan import Outlook
+from uavmec_jax.planning.plan import Plan
 from uavmec_jax.reporting.canvas import new_figure
 from uavmec_jax.reporting.map_figure import draw_devices
 
 _TITLES = {"rollout": "rollout planner", "beam": "beam (clairvoyant)"}
 
 
-def route_figure(outlook: Outlook, names: Sequence[str], scenario: str) -> Figure:
+def tour_figure(plan: Plan, names: Sequence[str], scenario: str) -> Figure:
     """One row per tour: the map, the battery fractions and the data ages after every slot."""
-    figure = new_figure(14, 4.2 * len(outlook.routes))
-    axes = figure.subplots(len(outlook.routes), 3, squeeze=False)
-    for (map_axis, battery_axis, age_axis), (name, route) in zip(axes, outlook.routes.items(), strict=True):
-        _map(map_axis, outlook, route.action, f"{_TITLES[name]}: {len(route.action)} slots")
-        slots = np.arange(len(route.action) + 1)
+    figure = new_figure(14, 4.2 * len(plan.tours))
+    axes = figure.subplots(len(plan.tours), 3, squeeze=False)
+    for (map_axis, battery_axis, age_axis), (name, tour) in zip(axes, plan.tours.items(), strict=True):
+        _map(map_axis, plan, tour.action, f"{_TITLES[name]}: {len(tour.action)} slots")
+        slots = np.arange(len(tour.action) + 1)
         for device, label in enumerate(names):
             colour = f"C{device % 10}"
             style = {"color": colour, "ls": "-" if device < 10 else "--", "lw": 1.3, "label": f"{device + 1} {label}"}
-            if not outlook.layout.has_power[device]:
-                fraction = route.state.battery[:, device] / outlook.layout.capacity[device]
+            if not plan.layout.has_power[device]:
+                fraction = tour.state.battery[:, device] / plan.layout.capacity[device]
                 battery_axis.plot(slots, np.append(1.0, fraction), **style)
-            if not outlook.layout.has_comms[device]:
-                age_axis.step(slots, np.append(0, route.state.age[:, device]), where="post", **style)
+            if not plan.layout.has_comms[device]:
+                age_axis.step(slots, np.append(0, tour.state.age[:, device]), where="post", **style)
         _finish(battery_axis, "battery, share of capacity", "batteries of devices without power")
         _finish(age_axis, "age, slots", "data of devices without communication")
         battery_axis.set_ylim(0, 1.02)
@@ -35,8 +35,8 @@ def route_figure(outlook: Outlook, names: Sequence[str], scenario: str) -> Figur
     return figure
 
 
-def _map(axis: Axes, outlook: Outlook, action: np.ndarray, title: str) -> None:
-    layout = outlook.layout
+def _map(axis: Axes, plan: Plan, action: np.ndarray, title: str) -> None:
+    layout = plan.layout
     stops = np.concatenate([np.zeros((1, 2)), layout.position[action]])
     axis.plot(stops[:, 0], stops[:, 1], color="0.6", lw=1.0, zorder=1)
     axis.plot(0, 0, marker="s", color="black", ls="", label="start")

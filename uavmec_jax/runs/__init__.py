@@ -1,1 +1,1 @@
-"""Runs that survive: shards, leases, snapshots, workers, status."""
+"""Runs that survive: shards, leases, checkpoints, workers, status."""

@@ -42,7 +42,7 @@ def submit_workers(prepare: Callable[[], Path], jobs: int, executor: str, parame
 
 def _work(directory: str) -> bool:
     """What runs on a node: one worker with the cores that the scheduler gave it."""
-    host.use_every_core()
+    host.use_all_cores()
     from uavmec_jax.runs.shared_run import work_on
 
     return work_on(directory)

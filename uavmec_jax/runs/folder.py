@@ -1,50 +1,31 @@
-"""The folder of a run: a plan that is checked, a folder per shard, and where each shard stands."""
+"""The folder of a run: a checked plan, a folder per shard, and the state of every shard."""
 
 import hashlib
 import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
 from uavmec_jax.errors import StudyError
-from uavmec_jax.files.leases import LEASE_S, is_quiet, read_lease
-from uavmec_jax.files.reading import read_facts, read_text
+from uavmec_jax.files.leases import is_stale, read_lease
+from uavmec_jax.files.reading import read_json_or_empty, read_text
 from uavmec_jax.files.writing import write_text
-from uavmec_jax.runs.checkpoints import INTERVAL_S, SHARE, Kind
-from uavmec_jax.runs.run_plan import Plan, Shard
+from uavmec_jax.runs.options import RunOptions
+from uavmec_jax.runs.run_plan import RunPlan, Shard
 from uavmec_jax.studies.results import RUN, STUDY
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.studies.study import parse_study, study_toml
 from uavmec_jax.training import host
-from uavmec_jax.training.partition import Blocks
+from uavmec_jax.training.partition import Partition
 
 SCHEMA = 1
-"""Version of a plan's file."""
+"""Version of a run plan's file."""
 
-PLAN, LOG, SHARDS = "plan.json", "log", "shards"
+RUN_PLAN, LOG, SHARDS, TOUR = "run_plan.json", "log", "shards", "tour.json"
 
 State = Literal["waiting", "running", "stopped", "failed", "done"]
-
-
-@dataclass(frozen=True)
-class Durability:
-    """How a run is kept.
-
-    Attributes:
-        snapshot: what is kept of a shard in training: ``full`` or ``weights``.
-        snapshot_every_s: least time between two snapshots.
-        snapshot_share: most of the time that they may take; it is longer between them where they are large.
-        lease_s: seconds without a sign after which a worker on another machine counts as dead.
-        tensorboard: whether curves are also written as TensorBoard's event files.
-    """
-
-    snapshot: Kind = "full"
-    snapshot_every_s: float = INTERVAL_S
-    snapshot_share: float = SHARE
-    lease_s: float = LEASE_S
-    tensorboard: bool = False
 
 
 class RunFolder:
@@ -52,7 +33,7 @@ class RunFolder:
 
     Attributes:
         path: the folder.
-        facts: what its plan says, checked.
+        facts: contents of its plan, checked.
     """
 
     def __init__(self, path: Path, facts: dict[str, Any]) -> None:
@@ -60,8 +41,8 @@ class RunFolder:
         self.facts = facts
 
     @classmethod
-    def create(cls, path: Path, study: Study, plan: Plan, durability: Durability, label: dict[str, Any]) -> "RunFolder":
-        """Write study and plan into a folder that exists, the plan last."""
+    def create(cls, path: Path, study: Study, plan: RunPlan, options: RunOptions, label: dict[str, Any]) -> "RunFolder":
+        """Write study and plan into an existing folder, the plan last."""
         text = study_toml(study)
         write_text(path / STUDY, text)
         facts = {
@@ -70,11 +51,11 @@ class RunFolder:
             "study_sha256": _sha256(text),
             "code_sha256": host.code_digest(),
             "versions": host.versions(),
-            "durability": asdict(durability),
+            "options": asdict(options),
             "plan": asdict(plan),
         }
         facts["sha256"] = _digest(facts)
-        write_text(path / PLAN, json.dumps(facts, indent=1) + "\n")
+        write_text(path / RUN_PLAN, json.dumps(facts, indent=1) + "\n")
         return cls(path, facts)
 
     @classmethod
@@ -85,9 +66,10 @@ class RunFolder:
             StudyError: the folder holds no run, its plan or its study is damaged or was altered, or it was written by a
                 newer version.
         """
-        file = path / PLAN
+        file = path / RUN_PLAN
         if not file.is_file():
-            raise StudyError(f"{path}: holds no run that can be resumed ({PLAN} is not there)")
+            tour = f"; it holds a tour of `uavmec plan` ({TOUR})" if (path / TOUR).is_file() else ""
+            raise StudyError(f"{path}: holds no run that can be resumed ({RUN_PLAN} is missing){tour}")
         try:
             facts = json.loads(read_text(file, StudyError))
             schema, digest = facts["schema"], facts["sha256"]
@@ -107,42 +89,42 @@ class RunFolder:
         return parse_study(read_text(self.path / STUDY, StudyError), str(self.path / STUDY))
 
     @cached_property
-    def plan(self) -> Plan:
-        """How it is cut."""
+    def plan(self) -> RunPlan:
+        """How the study is cut."""
         facts = dict(self.facts["plan"])
-        facts["blocks"] = {name: Blocks(**cut) for name, cut in facts["blocks"].items()}
-        return Plan(**facts)
+        facts["partitions"] = {name: Partition(**cut) for name, cut in facts["partitions"].items()}
+        return RunPlan(**facts)
 
     @cached_property
-    def durability(self) -> Durability:
-        """How it is kept."""
-        return Durability(**self.facts["durability"])
+    def options(self) -> RunOptions:
+        """How the run is checkpointed and logged."""
+        return RunOptions(**self.facts["options"])
 
     @property
     def fingerprint(self) -> str:
-        """What everything in the folder must be of."""
+        """Identity of the run, which every file in the folder carries."""
         return str(self.facts["sha256"])
 
     def other_code(self) -> list[str]:
-        """How code and libraries differ from those that planned the run; empty if they do not."""
+        """List how code and libraries differ from those that planned the run."""
         now = {"uavmec_jax's code": host.code_digest()} | host.versions()
         then = {"uavmec_jax's code": self.facts["code_sha256"]} | self.facts["versions"]
         return [f"{name} {then.get(name, '?')[:12]} -> {now[name][:12]}" for name in now if now[name] != then.get(name)]
 
     def check_code(self) -> None:
-        """Bits are only the same from the same code.
+        """Check that code and libraries are those that planned the run: only then are the bits the same.
 
         Raises:
             StudyError: the run was planned by other code or other versions of the libraries.
         """
         if differ := self.other_code():
             raise StudyError(
-                f"{self.path}: was planned by other code ({', '.join(differ)}), with which its bits would be others; "
+                f"{self.path}: was planned by other code ({', '.join(differ)}), whose bits would differ; "
                 "resume it with that code, or say --other-code"
             )
 
     def check_reward(self, given: Any) -> None:
-        """A reward that is a function of Python is not in the plan.
+        """Check that a Python reward function, which the plan cannot hold, is given if and only if the run has one.
 
         Raises:
             StudyError: the run was started with one and none is given, or the other way round.
@@ -154,36 +136,36 @@ class RunFolder:
 
     @property
     def complete(self) -> bool:
-        """Whether the results have been put together, which is the last thing that is done."""
+        """Whether the results have been assembled, which is the last step."""
         return (self.path / RUN).exists()
 
     @property
     def shards_folder(self) -> Path:
-        """Where the shards are until the run is complete; who holds it, started or resumed the run."""
+        """Where the shards are until the run is complete; its lease belongs to who started or resumed the run."""
         return self.path / SHARDS
 
     def shard_folder(self, shard: Shard) -> Path:
-        """Where a shard is kept; made when it is claimed."""
+        """Return the folder of a shard; it is made when the shard is claimed."""
         return self.shards_folder / f"{shard.number:05d}"
 
     def result(self, shard: Shard) -> Path:
-        """The file of a shard that is finished."""
+        """Return the file of a finished shard."""
         return self.shard_folder(shard) / "result.npz"
 
     def failure(self, shard: Shard) -> Path:
-        """The file that says why a shard could not be finished."""
+        """Return the file that says why a shard failed."""
         return self.shard_folder(shard) / "failed.json"
 
     def states(self) -> Iterator[tuple[Shard, State, dict[str, Any]]]:
-        """Where every shard stands, and what its latest holder told."""
+        """Yield the state of every shard, and the latest report of its holder."""
         complete = self.complete
         for shard in self.plan.shards:
             if complete or self.result(shard).exists():
                 yield shard, "done", {}
             elif self.failure(shard).exists():
-                yield shard, "failed", read_facts(self.failure(shard))
+                yield shard, "failed", read_json_or_empty(self.failure(shard))
             elif lease := read_lease(self.shard_folder(shard)):
-                yield shard, "stopped" if is_quiet(lease, self.durability.lease_s) else "running", lease
+                yield shard, "stopped" if is_stale(lease, self.options.lease_s) else "running", lease
             else:
                 yield shard, "waiting", {}
 

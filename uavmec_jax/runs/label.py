@@ -5,7 +5,7 @@ import sys
 from dataclasses import asdict
 from typing import Any
 
-from uavmec_jax.runs.run_plan import Plan
+from uavmec_jax.runs.run_plan import RunPlan
 from uavmec_jax.studies.places import describe_places
 from uavmec_jax.studies.population import seeds_of
 from uavmec_jax.studies.results import SCHEMA
@@ -13,8 +13,8 @@ from uavmec_jax.studies.schema import Study
 from uavmec_jax.training import host
 
 
-def label_of(study: Study, plan: Plan, command: str | None) -> dict[str, Any]:
-    """What is known of a run before it starts, for ``run.json``."""
+def label_of(study: Study, plan: RunPlan, command: str | None) -> dict[str, Any]:
+    """Return what is known of a run before it starts, for ``run.json``."""
     return {
         "schema": SCHEMA,
         "study": study.name,
@@ -25,6 +25,6 @@ def label_of(study: Study, plan: Plan, command: str | None) -> dict[str, Any]:
         "seeds": seeds_of(study),
         **({"places": places} if (places := describe_places(study)) else {}),
         "workers": plan.workers,
-        "blocks": {name: asdict(blocks) for name, blocks in plan.blocks.items()},
+        "partitions": {name: asdict(cut) for name, cut in plan.partitions.items()},
         **host.describe(),
     }

@@ -1,70 +1,121 @@
-"""What a run tells while it goes on: JSON lines, one file per process, and TensorBoard's event files if wanted."""
+"""The log of a run: JSON lines, one file per process; TensorBoard event files on request."""
 
 import json
+import logging
 import os
 import socket
-import time
+import sys
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from uavmec_jax.training import host
 
+OnEvent = Callable[[str, dict[str, Any]], None]
 
-class Log:
-    """Appends one JSON object per line to a file of this process's own; a line is whole or it is the last.
+CHUNK = "chunk"
+"""The event that carries a shard's curves."""
 
-    Every line has ``event``, ``at`` (the wall clock, for people) and the event's facts; ``on_event`` is told the same.
-    """
+
+class RunLog:
+    """Logs the events of one process that works on a run."""
 
     def __init__(
-        self, folder: Path | None, *, tensorboard: bool = False, on_event: Callable[[str, dict[str, Any]], None]
+        self, folder: Path, *, tensorboard: bool = False, on_event: OnEvent = lambda event, facts: None
     ) -> None:
-        self._folder = folder
-        self._on_event = on_event
-        self._file: Any = None
-        self._boards: dict[int, Any] = {}
-        self._tensorboard = tensorboard
+        """Open the log.
+
+        Args:
+            folder: of the log files; made when the first event is logged.
+            tensorboard: whether curves are also written as TensorBoard event files, beside the folder.
+            on_event: called with every event and its facts.
+
+        Raises:
+            StudyError: TensorBoard's writer is wanted and not installed.
+        """
+        self._logger = logging.Logger("uavmec_jax.run", logging.INFO)
+        self._logger.addHandler(_JsonLinesHandler(folder / f"{socket.gethostname()}-{os.getpid()}.jsonl"))
         if tensorboard:
-            writer_class()
+            self._logger.addHandler(_TensorBoardHandler(folder.parent / "tensorboard"))
+        self._on_event = on_event
 
-    def tell(self, event: str, **facts: Any) -> None:
-        """One event."""
-        if self._folder is not None:
-            with suppress(OSError):  # a full disk: what counts is the snapshot, and there it is told
-                self._append(json.dumps({"event": event, "at": round(time.time(), 3)} | facts) + "\n")
-        self._on_event(event, facts)
-
-    def _append(self, line: str) -> None:
-        if self._file is None:
-            assert self._folder is not None
-            self._folder.mkdir(parents=True, exist_ok=True)
-            self._file = (self._folder / f"{socket.gethostname()}-{os.getpid()}.jsonl").open("ab", buffering=0)
-        self._file.write(line.encode())
+    def event(self, name: str, **facts: Any) -> None:
+        """Log an event; the values of ``facts`` are what JSON can hold."""
+        self._logger.info(name, extra={"facts": facts})
+        self._on_event(name, facts)
 
     def curve(self, shard: int, steps: int, **values: float) -> None:
-        """Points of a shard's curves, at a number of environment steps of one agent."""
-        self.tell("chunk", shard=shard, steps=steps, **values)
-        if self._tensorboard and self._folder is not None:
-            if shard not in self._boards:
-                folder = self._folder.parent / "tensorboard" / f"shard-{shard:05d}"
-                self._boards[shard] = writer_class()(str(folder))
-            for name, value in values.items():
-                self._boards[shard].add_scalar(name, value, steps)
+        """Log points of a shard's curves, at a number of environment steps of one agent."""
+        self.event(CHUNK, shard=shard, steps=steps, **values)
 
     def close(self) -> None:
-        """Let go of the files."""
-        if self._file is not None:
-            self._file.close()
-            self._file = None
-        for board in self._boards.values():
-            board.close()
-        self._boards.clear()
+        """Close the files."""
+        for handler in self._logger.handlers:
+            handler.close()
 
 
-def writer_class() -> Any:
-    """TensorBoard's writer.
+class _JsonFormatter(logging.Formatter):
+    """One JSON object per line: the event, the wall clock, and the event's facts."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        facts: dict[str, Any] = record.facts  # type: ignore[attr-defined]
+        return json.dumps({"event": record.getMessage(), "at": round(record.created, 3)} | facts)
+
+
+class _JsonLinesHandler(logging.FileHandler):
+    """Appends lines to a file whose folder is made when it is opened; on a full disk the log has a gap."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, encoding="utf-8", delay=True)
+        self.setFormatter(_JsonFormatter())
+
+    def _open(self) -> Any:
+        Path(self.baseFilename).parent.mkdir(parents=True, exist_ok=True)
+        return super()._open()
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 (logging calls it so)
+        """Ignore what the disk refuses: a run reports that when it writes its next checkpoint."""
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handleError(record)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a line; a folder that cannot be made is ignored like a full disk."""
+        try:
+            super().emit(record)
+        except OSError:
+            self.handleError(record)
+
+
+class _TensorBoardHandler(logging.Handler):
+    """Writes curves as TensorBoard event files, one folder per shard."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        self._folder = folder
+        self._writers: dict[int, Any] = {}
+        self._writer_class = tensorboard_writer()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Add the scalars of a chunk."""
+        if record.getMessage() != CHUNK:
+            return
+        facts: dict[str, Any] = dict(record.facts)  # type: ignore[attr-defined]
+        shard, steps = facts.pop("shard"), facts.pop("steps")
+        if shard not in self._writers:
+            self._writers[shard] = self._writer_class(str(self._folder / f"shard-{shard:05d}"))
+        for name, value in facts.items():
+            self._writers[shard].add_scalar(name, value, steps)
+
+    def close(self) -> None:
+        """Close the writers."""
+        for writer in self._writers.values():
+            writer.close()
+        self._writers.clear()
+        super().close()
+
+
+def tensorboard_writer() -> Any:
+    """Return TensorBoard's writer class.
 
     Raises:
         StudyError: it is not installed.

@@ -1,4 +1,4 @@
-"""Run a study: in this process or by several, in one go or taken up again; and put together what they left."""
+"""Run a study in this process or by several, start to finish or resumed, and assemble the results."""
 
 import shutil
 import time
@@ -9,26 +9,27 @@ from typing import Any
 
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files.leases import Leases
-from uavmec_jax.runs.folder import PLAN, SHARDS, Durability, RunFolder
+from uavmec_jax.runs.folder import RUN_PLAN, SHARDS, RunFolder
 from uavmec_jax.runs.label import label_of
-from uavmec_jax.runs.log import writer_class
+from uavmec_jax.runs.log import OnEvent, tensorboard_writer
+from uavmec_jax.runs.options import RunOptions
 from uavmec_jax.runs.results_folder import (
+    assemble_results,
     check_directory,
     check_empty,
-    help_with,
     load_results,
     partial_results,
-    put_together,
-    sound_shards,
+    read_finished_shards,
+    worker_hint,
 )
-from uavmec_jax.runs.run_plan import Plan, plan_study
-from uavmec_jax.runs.shard_runner import Bench
-from uavmec_jax.runs.signals import Stop
+from uavmec_jax.runs.run_plan import RunPlan, plan_run
+from uavmec_jax.runs.shard_runner import ShardRunner
+from uavmec_jax.runs.signals import StopSignal
 from uavmec_jax.runs.team import work_together
-from uavmec_jax.runs.worker import OnEvent, OnProgress, make_worker
+from uavmec_jax.runs.worker import OnProgress, make_worker
 from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.schema import Study
-from uavmec_jax.studies.shard_result import Finished
+from uavmec_jax.studies.shard_result import ShardResult
 from uavmec_jax.training.population import Progress
 
 RewardFunction = Callable[[Mapping[str, Any]], Any]
@@ -42,30 +43,30 @@ def run_study(
     command: str | None = None,
     workers: int = 1,
     shard_size: int | None = None,
-    durability: Durability | None = None,
+    options: RunOptions | None = None,
     on_progress: OnProgress = lambda _: None,
     on_event: OnEvent = lambda event, facts: None,
 ) -> Results:
-    """Train and judge the population of a study.
+    """Train and evaluate the population of a study.
 
-    In a directory the run survives whatever happens: see :func:`resume_run`. Ctrl-C or SIGTERM end it early; the results
-    then hold the finished shards, ``run["complete"]`` is False and ``run["stopped_by"]`` is the signal's number.
+    With a directory, the run can be resumed whatever happens: see :func:`resume_run`. Ctrl-C or SIGTERM end it early; the
+    results then hold the finished shards, ``run["complete"]`` is False and ``run["stopped_by"]`` is the signal's number.
 
     Args:
-        study: from :func:`uavmec_jax.studies.study.load_study`.
+        study: from :func:`um.load_study`.
         directory: where to save; ``None`` saves nothing.
-        reward: a function of the terms (see :func:`um.make_reward`) in place of the study's reward; the run's label
+        reward: a function of the terms (see :func:`um.make_reward`) that replaces the study's reward; the run's label
             then names it.
         command: the command line, for the label of the results.
         workers: processes; more than one need a directory.
         shard_size: most agents in a shard; by default what the devices' caches hold.
-        durability: how the run is kept.
-        on_progress: told after every chunk.
-        on_event: told ``(event, facts)`` of everything that is logged.
+        options: how the run is checkpointed and logged.
+        on_progress: called after every chunk.
+        on_event: called with ``(event, facts)`` of everything that is logged.
 
     Raises:
         StudyError: the population does not fit, the directory cannot take a run or somebody is at work in it, shards
-            have failed, ``reward`` stands beside an axis of rewards, or tensorboardX is wanted and not installed.
+            have failed, ``reward`` is given beside an axis of rewards, or tensorboardX is wanted and not installed.
     """
     if reward is not None and "reward" in study.axes:
         raise StudyError(f"{study.name}: axes.reward is given, and a reward function too; leave one of them out")
@@ -75,22 +76,21 @@ def run_study(
         )
     if directory is not None:
         check_directory(Path(directory))
-    plan = plan_study(study, workers=workers, shard_size=shard_size)
+    plan = plan_run(study, workers=workers, shard_size=shard_size)
     label = label_of(study, plan, command)
     if reward is not None:
         label["reward_function"] = getattr(reward, "__qualname__", repr(reward))
-    bench = Bench(study, plan, reward)
+    runner = ShardRunner(study, plan, reward)
     if directory is None:
-        return _run_in_memory(study, plan, bench, label, on_progress)
-    path = Path(directory)
-    durability = durability or Durability()
-    if durability.tensorboard:
-        writer_class()
-    lease = Leases(durability.lease_s).hold(path / SHARDS, path, help_with(path))
+        return _run_in_memory(study, plan, runner, label, on_progress)
+    path, options = Path(directory), options or RunOptions()
+    if options.tensorboard:
+        tensorboard_writer()
+    lease = Leases(options.lease_s).hold(path / SHARDS, path, worker_hint(path))
     try:
         check_empty(path)
-        RunFolder.create(path, study, plan, durability, label)
-        return _run(path, bench, workers, on_progress, on_event)
+        RunFolder.create(path, study, plan, options, label)
+        return _run(path, runner, workers, on_progress, on_event)
     finally:
         lease.release()
 
@@ -104,17 +104,17 @@ def resume_run(
     on_progress: OnProgress = lambda _: None,
     on_event: OnEvent = lambda event, facts: None,
 ) -> Results:
-    """Go on with a run that was stopped or killed; it ends with the bits of a run that was not.
+    """Resume a run that was stopped or killed; it ends with the bits of a run that was not.
 
-    Finished shards are kept, the others go on from their last sound snapshot; shards that failed are tried again.
+    Finished shards are kept, the others resume from their last intact checkpoint; shards that failed are tried again.
 
     Args:
         directory: of the run.
-        reward: the function that the run was started with, if it was.
+        reward: the function that the run was started with, if any.
         workers: processes; by default as many as the run was planned for.
-        other_code: go on although code or libraries are not those that planned the run; its label then says so.
-        on_progress: told after every chunk.
-        on_event: told ``(event, facts)`` of everything that is logged.
+        other_code: resume although code or libraries are not those that planned the run; its label then says so.
+        on_progress: called after every chunk.
+        on_event: called with ``(event, facts)`` of everything that is logged.
 
     Raises:
         StudyError: the directory holds no run, its plan is damaged, somebody is at work in it, it needs its reward
@@ -128,13 +128,13 @@ def resume_run(
         return load_results(path)
     if not other_code:
         folder.check_code()
-    lease = Leases(folder.durability.lease_s).hold(folder.shards_folder, path, help_with(path))
+    lease = Leases(folder.options.lease_s).hold(folder.shards_folder, path, worker_hint(path))
     try:
         for shard in folder.plan.shards:
             folder.failure(shard).unlink(missing_ok=True)
         label = {"other_code": differ} if (differ := folder.other_code()) else {}
-        bench = Bench(folder.study, folder.plan, reward)
-        return _run(path, bench, workers or folder.plan.workers, on_progress, on_event, label)
+        runner = ShardRunner(folder.study, folder.plan, reward)
+        return _run(path, runner, workers or folder.plan.workers, on_progress, on_event, label)
     finally:
         lease.release()
 
@@ -142,71 +142,73 @@ def resume_run(
 def run_or_resume(
     study: Study, directory: str | Path, *, command: str | None = None, on_progress: OnProgress = lambda _: None
 ) -> Results:
-    """Run a study in a folder, or go on with the run that is there; one that is complete is read."""
-    if (Path(directory) / PLAN).exists():
+    """Run a study in a folder, or resume the run that is there; the results of a complete one are loaded."""
+    if (Path(directory) / RUN_PLAN).exists():
         return resume_run(directory, on_progress=on_progress)
     return run_study(study, directory, command=command, on_progress=on_progress)
 
 
 def _run(
     path: Path,
-    bench: Bench,
+    runner: ShardRunner,
     workers: int,
     on_progress: OnProgress,
     on_event: OnEvent,
     label: Mapping[str, Any] = MappingProxyType({}),
 ) -> Results:
-    """Work until all shards are finished, and put the results together."""
-    with Stop() as stop:
-        worker = make_worker(path, bench=bench, stop=stop, on_progress=on_progress, on_event=on_event)
+    """Work until all shards are finished, and assemble the results."""
+    with StopSignal() as stop:
+        worker = make_worker(path, runner=runner, stop=stop, on_progress=on_progress, on_event=on_event)
         folder = worker.folder
-        stopped: KeyboardInterrupt | None = None
         try:
             while True:
                 if workers > 1:
-                    work_together(folder, workers, stop, on_progress, worker.log.tell)
+                    work_together(folder, workers, stop, on_progress, worker.log.event)
                 else:
                     worker.work()
-                finished, damaged = sound_shards(folder, worker.log.tell)
+                finished, damaged = read_finished_shards(folder, worker.log.event)
                 if not damaged:
                     break
-                worker.forget(damaged)
-        except KeyboardInterrupt as order:
-            stopped = order
+                worker.reopen(damaged)
+        except KeyboardInterrupt as interrupt:
+            results = partial_results(folder)
+            results.run["stopped_by"] = getattr(interrupt, "signal", 2)
+            return results
         finally:
             worker.log.close()
-        if stopped is not None:
-            results = partial_results(folder)
-            results.run["stopped_by"] = getattr(stopped, "signal", 2)
-            return results
-        failed = [(shard, facts) for shard, state, facts in folder.states() if state == "failed"]
-        if failed:
-            shard, facts = failed[0]
-            raise StudyError(
-                f"{path}: {len(failed)} of {len(folder.plan.shards)} shards failed, shard {shard.number} with "
-                f"{facts.get('error', 'an unknown error')} ({folder.failure(shard)}); `uavmec resume {path}` tries them again"
-            )
-        return put_together(folder, finished, **label)
+        _check_failures(folder)
+        return assemble_results(folder, finished, **label)
 
 
-def _run_in_memory(study: Study, plan: Plan, bench: Bench, label: dict, on_progress: OnProgress) -> Results:
-    """Train and judge shard after shard in this process, keeping nothing."""
-    finished: list[Finished] = []
-    steps_before = 0
+def _check_failures(folder: RunFolder) -> None:
+    failed = [(shard, facts) for shard, state, facts in folder.states() if state == "failed"]
+    if failed:
+        shard, facts = failed[0]
+        raise StudyError(
+            f"{folder.path}: {len(failed)} of {len(folder.plan.shards)} shards failed, shard {shard.number} with "
+            f"{facts.get('error', 'an unknown error')} ({folder.failure(shard)}); `uavmec resume {folder.path}` tries them "
+            "again"
+        )
+
+
+def _run_in_memory(study: Study, plan: RunPlan, runner: ShardRunner, label: dict, on_progress: OnProgress) -> Results:
+    """Train and evaluate shard after shard in this process, saving nothing."""
+    finished: list[ShardResult] = []
+    done = 0
     interrupted = False
     try:
         for shard in plan.shards:
             tick = time.perf_counter()
-            training = bench.start(shard)
-            while training is not None and not training.finished:
-                training.advance()
-                steps = steps_before + shard.agents * training.steps
-                on_progress(Progress(shard.number, steps, plan.work, training.mean_length))
-            finished.append(bench.finish(shard, training))
+            training = runner.start(shard)
+            if training is not None:
+                for _ in training.run():
+                    steps = done + shard.agents * training.steps
+                    on_progress(Progress(shard.number, steps, plan.work, training.mean_episode_length))
+            finished.append(runner.finish(shard, training))
             finished[-1].seconds["wall"] = time.perf_counter() - tick
-            steps_before += plan.work_of(shard)
+            done += plan.work_of(shard)
             if training is None:
-                on_progress(Progress(shard.number, steps_before, plan.work, float("nan")))
+                on_progress(Progress(shard.number, done, plan.work, float("nan")))
     except KeyboardInterrupt:
         interrupted = True
     results = Results.of(study, label, finished, plan.agents)

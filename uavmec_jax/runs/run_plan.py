@@ -1,4 +1,4 @@
-"""What a run will take, known before anything is compiled or written: how a study is cut into shards, and what it costs."""
+"""The run plan: how a study is cut into shards and what it costs, known before anything is compiled or written."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -7,27 +7,27 @@ import jax
 
 from uavmec_jax.errors import StudyError
 from uavmec_jax.studies.places import load_evacuations
-from uavmec_jax.studies.population import make_algorithm, n_agents, parts
+from uavmec_jax.studies.population import make_algorithm, n_agents, split_by_algorithm
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.training import host
-from uavmec_jax.training.partition import Blocks, PopulationTooLargeError, plan_blocks
+from uavmec_jax.training.partition import Partition, PopulationTooLargeError, partition_population
 
-_UNTRAINED_BLOCK = 100
+_UNTRAINED_SHARD = 100
 """Scenarios in a shard where nothing is trained."""
 
 BYTES_WITHOUT_TRAINING = 100_000
-"""An agent that is done, in memory and on disk: two sets of weights, evaluation, curves."""
+"""A finished agent, in memory and on disk: two sets of weights, evaluation, curves."""
 
 
 @dataclass(frozen=True)
 class Shard:
-    """Agents that one process trains and judges as one piece: a block of one algorithm.
+    """Agents of one algorithm that one process trains and evaluates as one piece.
 
     Attributes:
         number: in the plan, from 0.
         algorithm: its name, ``none`` where nothing is trained.
         first: its first agent, among those of the algorithm.
-        agents: how many; the block is padded to the size of all others.
+        agents: number of agents; a shard is padded to the size of all others.
     """
 
     number: int
@@ -37,20 +37,20 @@ class Shard:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """How a study is cut. It is part of the result: the size of a group of agents decides over the last bits.
+class RunPlan:
+    """How a study is cut. It is part of the result: the last bits depend on the size of a group of agents.
 
     Attributes:
-        agents: in all.
-        blocks: algorithm -> how its agents are cut.
-        members: algorithm -> its agents.
+        agents: of all algorithms.
+        partitions: algorithm -> how its agents are cut.
+        members: algorithm -> number of its agents.
         steps: algorithm -> environment steps of one agent, in whole iterations; 0 where nothing is trained.
         workers: processes that it was made for.
         free_bytes: memory that was free.
     """
 
     agents: int
-    blocks: dict[str, Blocks]
+    partitions: dict[str, Partition]
     members: dict[str, int]
     steps: dict[str, int]
     workers: int
@@ -58,44 +58,44 @@ class Plan:
 
     @cached_property
     def shards(self) -> list[Shard]:
-        """In the order of the results: algorithm after algorithm."""
-        found: list[Shard] = []
-        for name, cut in self.blocks.items():
-            for first in range(0, cut.count * cut.size, cut.size):
-                found.append(Shard(len(found), name, first, min(cut.size, self.members[name] - first)))
-        return found
+        """The shards in the order of the results: algorithm after algorithm."""
+        shards: list[Shard] = []
+        for name, cut in self.partitions.items():
+            for first in range(0, cut.shards * cut.shard_size, cut.shard_size):
+                agents = min(cut.shard_size, self.members[name] - first)
+                shards.append(Shard(len(shards), name, first, agents))
+        return shards
 
     @property
     def total_steps(self) -> int:
         """Environment steps of all agents."""
-        return sum(self.members[name] * self.steps[name] for name in self.blocks)
+        return sum(self.members[name] * self.steps[name] for name in self.partitions)
 
     @property
     def work(self) -> int:
-        """What progress is counted in: environment steps, or scenarios where nothing is trained."""
+        """The unit of progress: environment steps, or scenarios where nothing is trained."""
         return self.total_steps or self.agents
 
     def work_of(self, shard: Shard) -> int:
-        """A shard's part of :attr:`work`."""
+        """Return a shard's part of :attr:`work`."""
         return shard.agents * (self.steps[shard.algorithm] or 1)
 
     def __str__(self) -> str:
         if not self.total_steps:
             return f"{self.agents} scenarios, nothing is trained"
-        every = list(self.blocks.values())
-        count = len(self.shards)
-        sizes = "+".join(f"{blocks.count} x {blocks.size}" for blocks in every)
-        cut = f"{count} shard{'s' * (count > 1)}{f' ({sizes})' if len(every) > 1 else f' of {every[0].size}'}"
-        memory = (
-            f"{self.workers * max(b.bytes for b in every) / 2**30:.2f} GiB of {self.free_bytes / 2**30:.1f} GiB free"
-        )
-        groups = max(blocks.groups for blocks in every)
-        by = f"{groups} device{'s' * (groups > 1)}"
-        by = f"{self.workers} workers with {by} each" if self.workers > 1 else by
-        return f"{self.agents:,} agents x {self.total_steps // self.agents:,} steps in {cut} on {by}, {memory}"
+        cuts, count = list(self.partitions.values()), len(self.shards)
+        sizes = "+".join(f"{cut.shards} x {cut.shard_size}" for cut in cuts)
+        of_size = f" ({sizes})" if len(cuts) > 1 else f" of {cuts[0].shard_size}"
+        needed = self.workers * max(cut.shard_bytes for cut in cuts)
+        memory = f"{needed / 2**30:.2f} GiB of {self.free_bytes / 2**30:.1f} GiB free"
+        groups = max(cut.groups for cut in cuts)
+        devices = f"{groups} device{'s' * (groups > 1)}"
+        devices = f"{self.workers} workers with {devices} each" if self.workers > 1 else devices
+        steps = self.total_steps // self.agents
+        return f"{self.agents:,} agents x {steps:,} steps in {count} shard{'s' * (count > 1)}{of_size} on {devices}, {memory}"
 
 
-def plan_study(study: Study, *, workers: int = 1, shard_size: int | None = None, jobs: int = 1) -> Plan:
+def plan_run(study: Study, *, workers: int = 1, shard_size: int | None = None, jobs: int = 1) -> RunPlan:
     """Estimate memory and cut the population into equal shards.
 
     Args:
@@ -116,27 +116,25 @@ def plan_study(study: Study, *, workers: int = 1, shard_size: int | None = None,
             f"{study.name}: {agents:,} agents need {needed / 2**30:,.0f} GiB of memory, and as much disk, when all are "
             f"trained; {free / 2**30:.1f} GiB are free; shorten an axis, or make several studies of it"
         )
-    groups = max(jax.local_device_count() // workers, 1)
-    blocks: dict[str, Blocks] = {}
+    partitions: dict[str, Partition] = {}
     members: dict[str, int] = {}
     steps: dict[str, int] = {}
-    for part in parts(study):
-        algorithm, own = make_algorithm(part), n_agents(part)
-        largest = min(shard_size or own, -(-own // max(workers, jobs)))
-        members[part.algorithm] = own
-        steps[part.algorithm] = algorithm.total_steps if algorithm else 0
+    for own in split_by_algorithm(study):
+        algorithm, count = make_algorithm(own), n_agents(own)
+        max_shard = min(shard_size or count, -(-count // max(workers, jobs)))
+        members[own.algorithm], steps[own.algorithm] = count, algorithm.total_steps if algorithm else 0
         if algorithm is None:
-            size = min(_UNTRAINED_BLOCK, largest)
-            blocks[part.algorithm] = Blocks(count=-(-own // size), size=size, groups=1, bytes=0)
+            size = min(_UNTRAINED_SHARD, max_shard)
+            partitions[own.algorithm] = Partition(shards=-(-count // size), shard_size=size, groups=1, shard_bytes=0)
             continue
         try:
-            blocks[part.algorithm] = plan_blocks(
-                own,
+            partitions[own.algorithm] = partition_population(
+                count,
                 algorithm.agent_bytes,
                 (free - needed) // workers,
-                groups=groups,
-                largest=largest if largest < own else None,
+                groups=max(jax.local_device_count() // workers, 1),
+                max_shard=max_shard if max_shard < count else None,
             )
         except PopulationTooLargeError as error:
             raise StudyError(f"{study.name}: steps is {study.steps}: {error}") from None
-    return Plan(agents=agents, blocks=blocks, members=members, steps=steps, workers=workers, free_bytes=free)
+    return RunPlan(agents=agents, partitions=partitions, members=members, steps=steps, workers=workers, free_bytes=free)

@@ -1,4 +1,4 @@
-"""One shard of a study: its agents made from their identities, trained, judged, and kept in a file."""
+"""Train and evaluate the shards of a study in this process."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -11,107 +11,107 @@ import pandas as pd
 
 from uavmec_jax.agents.algorithm import Agent, Algorithm
 from uavmec_jax.env.rewards import Reward, make_reward
-from uavmec_jax.runs.run_plan import Plan, Shard
-from uavmec_jax.studies.evaluation import Distinct, Judgement, judge_all, judge_learned
+from uavmec_jax.runs.run_plan import RunPlan, Shard
+from uavmec_jax.studies.axes import TRACED_PARAMS
+from uavmec_jax.studies.evaluation import DistinctScenarios, EvaluationResult, evaluate_all, evaluate_learned
 from uavmec_jax.studies.population import (
-    Who,
+    AgentId,
     evaluation_keys,
-    identities,
+    make_agent_ids,
     make_agents,
     make_algorithm,
-    parts,
+    split_by_algorithm,
     validation_keys,
 )
-from uavmec_jax.studies.schema import TRACED_PARAMS, Study
-from uavmec_jax.studies.shard_result import Finished
+from uavmec_jax.studies.schema import Study
+from uavmec_jax.studies.shard_result import ShardResult
 from uavmec_jax.training.training import Trainer, Training, Validation
 
-_WHAT_IS_PLAYED = ("seed", "powered", "connected", "scenarios", "place", *TRACED_PARAMS)
-"""Columns that say what an agent plays; all others say how it learns (as the seed does where scenarios are drawn)."""
+_SCENARIO_AXES = ("seed", "powered", "connected", "scenarios", "place", *TRACED_PARAMS)
+"""Axes of the scenario that an agent plays; all others are about its training (as is the seed of drawn scenarios)."""
 
 
-class Bench:
-    """Trains and judges shards of one study in this process; every algorithm is compiled once."""
+class ShardRunner:
+    """Trains and evaluates shards of one study; every algorithm is compiled once."""
 
-    def __init__(self, study: Study, plan: Plan, reward: Callable[[Mapping[str, Any]], Any] | None = None) -> None:
+    def __init__(self, study: Study, plan: RunPlan, reward: Callable[[Mapping[str, Any]], Any] | None = None) -> None:
+        """Prepare for a study; ``reward`` is a function of the reward's terms that replaces the study's reward."""
         own = make_reward(reward, study.guard) if reward is not None else None
-        self._parts: dict[str, _Part] = {
-            part.algorithm: _Part(part, plan, "algorithm" in study.axes, own) for part in parts(study)
+        self._runners = {
+            part.algorithm: _AlgorithmRunner(part, plan, "algorithm" in study.axes, own)
+            for part in split_by_algorithm(study)
         }
 
     def start(self, shard: Shard) -> Training | None:
-        """The shard before its first step; ``None`` if nothing is trained."""
-        return self._parts[shard.algorithm].start(shard)
+        """Return the shard before its first step; ``None`` if nothing is trained."""
+        return self._runners[shard.algorithm].start(shard)
 
-    def finish(self, shard: Shard, training: Training | None) -> Finished:
-        """Judge a shard that is trained to the end, or needs no training."""
-        return self._parts[shard.algorithm].finish(shard, training)
+    def finish(self, shard: Shard, training: Training | None) -> ShardResult:
+        """Evaluate a shard that is trained to the end, or needs no training."""
+        return self._runners[shard.algorithm].finish(shard, training)
 
-    def who(self, shard: Shard) -> Who:
-        """The identities of a shard's agents."""
-        return self._parts[shard.algorithm].who[shard.first : shard.first + shard.agents]
+    def agent_ids(self, shard: Shard) -> list[AgentId]:
+        """Return the identities of a shard's agents."""
+        return self._runners[shard.algorithm].agent_ids[shard.first : shard.first + shard.agents]
 
 
 @dataclass
-class _Part:
-    """The agents of one algorithm of a study, or those that nothing trains."""
+class _AlgorithmRunner:
+    """Runs the shards of one algorithm of a study, or those where nothing is trained."""
 
     study: Study
-    plan: Plan
-    named: bool
+    plan: RunPlan
+    names_algorithm: bool
     """Whether the table names the algorithm."""
     reward: Reward | None
     trainer: Trainer | None = None
     """Compiled for the first shard."""
 
     @cached_property
-    def who(self) -> Who:
-        return identities(self.study)
+    def agent_ids(self) -> list[AgentId]:
+        return make_agent_ids(self.study)
 
     @cached_property
     def algorithm(self) -> Algorithm | None:
         return make_algorithm(self.study)
 
-    def members(self, shard: Shard) -> tuple[Who, Agent]:
-        """The agents of a shard, the last one repeated to fill the block."""
-        size = self.plan.blocks[self.study.algorithm].size
-        who = self.who[shard.first : shard.first + shard.agents]
-        who = who + [who[-1]] * (size - shard.agents)
-        return who, make_agents(self.study, self.reward, who)
+    def members(self, shard: Shard) -> tuple[list[AgentId], Agent]:
+        """The agents of a shard, the last one repeated as padding."""
+        size = self.plan.partitions[self.study.algorithm].shard_size
+        agent_ids = self.agent_ids[shard.first : shard.first + shard.agents]
+        agent_ids = agent_ids + [agent_ids[-1]] * (size - shard.agents)
+        return agent_ids, make_agents(self.study, self.reward, agent_ids)
 
     def start(self, shard: Shard) -> Training | None:
         if self.algorithm is None:
             return None
-        who, agents = self.members(shard)
-        keys = validation_keys(self.study, who)
+        agent_ids, agents = self.members(shard)
+        keys = validation_keys(self.study, agent_ids)
         if self.trainer is not None:
             return self.trainer.start(agents, keys)
-        settings, blocks = self.study.evaluation, self.plan.blocks[self.study.algorithm]
+        settings, partition = self.study.evaluation, self.plan.partitions[self.study.algorithm]
         validation = Validation(every=settings.validate_every, draws=settings.validation_draws)
-        self.trainer = Trainer.compile(self.algorithm, agents, keys, validation, blocks)
+        self.trainer = Trainer.compile(self.algorithm, agents, keys, validation, partition)
         training = self.trainer.start(agents, keys)
         training.seconds["compile"] = self.trainer.compile_seconds
         return training
 
-    def finish(self, shard: Shard, training: Training | None) -> Finished:
+    def finish(self, shard: Shard, training: Training | None) -> ShardResult:
         tick = time.perf_counter()
-        who, agents = self.members(shard)
-        keys = evaluation_keys(self.study, who)
+        agent_ids, agents = self.members(shard)
+        keys = evaluation_keys(self.study, agent_ids)
         members, keys = jax.tree.map(lambda leaf: leaf[: shard.agents], (agents, keys))
-        rows = pd.DataFrame(who[: shard.agents])
-        drawn = "scenarios" in rows
-        distinct = Distinct.of(
-            rows[[name for name in rows if name in _WHAT_IS_PLAYED and not (drawn and name == "seed")]]
-        )
-        if self.named:
+        rows = pd.DataFrame(agent_ids[: shard.agents])
+        distinct = DistinctScenarios.of(rows[_scenario_columns(rows)])
+        if self.names_algorithm:
             rows.insert(3, "algorithm", self.study.algorithm)
         weights: dict[str, Any] = {}
         curves: dict[str, Any] = {}
-        learned: dict[str, Judgement] = {}
+        learned: dict[str, EvaluationResult] = {}
         if self.algorithm and training:
-            trained = training.trained(shard.agents)
+            trained = training.result(shard.agents)
             weights = {"best": trained.best, "last": trained.last}
-            names = ("chunk_steps", "episode_length", "look_steps", "validation")
+            names = ("chunk_steps", "episode_length", "validation_steps", "validation")
             curves = {name: getattr(trained, name) for name in names}
             rows = rows.assign(
                 steps=self.algorithm.total_steps,
@@ -119,10 +119,10 @@ class _Part:
                 best_step=trained.best_step,
                 best_validation=trained.best_score,
             )
-            learned = judge_learned(self.algorithm, members, keys, weights)
-        columns, evaluation, planning = judge_all(members, keys, learned, distinct, self.study.evaluation)
+            learned = evaluate_learned(self.algorithm, members, keys, weights)
+        columns, evaluation, planning = evaluate_all(members, keys, learned, distinct, self.study.evaluation)
         seconds = {"evaluate": time.perf_counter() - tick - planning, "plan": planning}
-        return Finished(
+        return ShardResult(
             algorithm=self.study.algorithm,
             rows=rows.assign(**columns),
             curves=curves,
@@ -131,3 +131,9 @@ class _Part:
             seconds=seconds | (training.seconds if training else {}),
             steps=shard.agents * (self.algorithm.total_steps if self.algorithm else 0),
         )
+
+
+def _scenario_columns(rows: pd.DataFrame) -> list[str]:
+    """The columns that tell the scenarios of agents apart."""
+    drawn = "scenarios" in rows
+    return [name for name in rows if name in _SCENARIO_AXES and not (drawn and name == "seed")]

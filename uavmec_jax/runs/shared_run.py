@@ -4,12 +4,20 @@ from pathlib import Path
 
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files.leases import Leases
-from uavmec_jax.runs.folder import SHARDS, Durability, RunFolder
+from uavmec_jax.runs.folder import SHARDS, RunFolder
 from uavmec_jax.runs.label import label_of
-from uavmec_jax.runs.results_folder import check_directory, check_empty, finished_shards, help_with, put_together
-from uavmec_jax.runs.run_plan import plan_study
-from uavmec_jax.runs.signals import Stop
-from uavmec_jax.runs.worker import OnEvent, OnProgress, Worker, make_worker
+from uavmec_jax.runs.log import OnEvent
+from uavmec_jax.runs.options import RunOptions
+from uavmec_jax.runs.results_folder import (
+    assemble_results,
+    check_directory,
+    check_empty,
+    finished_shards,
+    worker_hint,
+)
+from uavmec_jax.runs.run_plan import plan_run
+from uavmec_jax.runs.signals import StopSignal
+from uavmec_jax.runs.worker import OnProgress, Worker, make_worker
 from uavmec_jax.studies.schema import Study
 
 
@@ -21,25 +29,25 @@ def prepare_run(
     workers: int = 1,
     shard_size: int | None = None,
     jobs: int = 1,
-    durability: Durability | None = None,
+    options: RunOptions | None = None,
 ) -> RunFolder:
-    """Plan a run that workers (:func:`work_on`) then make.
+    """RunPlan a run that workers (:func:`work_on`) then make.
 
     Args:
-        study, directory, command, shard_size, durability: see :func:`run_study`.
+        study, directory, command, shard_size, options: see :func:`run_study`.
         workers: processes that share one machine.
         jobs: workers on all machines together.
 
     Raises:
         StudyError: see :func:`run_study`.
     """
-    path, durability = Path(directory), durability or Durability()
+    path, options = Path(directory), options or RunOptions()
     check_directory(path)
-    plan = plan_study(study, workers=workers, shard_size=shard_size, jobs=jobs)
-    lease = Leases(durability.lease_s).hold(path / SHARDS, path, help_with(path))
+    plan = plan_run(study, workers=workers, shard_size=shard_size, jobs=jobs)
+    lease = Leases(options.lease_s).hold(path / SHARDS, path, worker_hint(path))
     try:
         check_empty(path)
-        return RunFolder.create(path, study, plan, durability, label_of(study, plan, command))
+        return RunFolder.create(path, study, plan, options, label_of(study, plan, command))
     finally:
         lease.release()
 
@@ -64,10 +72,10 @@ def work_on(
     Raises:
         StudyError: the directory holds no run, its plan is damaged, it was planned by other code, or has a reward
             function, which only :func:`um.resume_run` can be given.
-        Stopped: a signal came; what this worker had is kept.
+        Interrupted: a signal came; what this worker had is kept.
     """
     path = Path(directory)
-    with Stop() as stop:
+    with StopSignal() as stop:
         worker = make_worker(path, stop=stop, on_progress=on_progress, on_event=on_event)
         worker.folder.check_code()
         worker.folder.check_reward(None)
@@ -77,11 +85,11 @@ def work_on(
             worker.log.close()
         complete = all(state == "done" for _, state, _ in worker.folder.states())
         if complete and not worker.folder.complete:
-            _put_together_alone(worker)
+            _assemble_alone(worker)
     return complete
 
 
-def _put_together_alone(worker: Worker) -> None:
+def _assemble_alone(worker: Worker) -> None:
     """Unless somebody holds the run who does it: the one that started it, or another worker."""
     try:
         lease = worker.leases.hold(worker.folder.shards_folder, worker.folder.path)
@@ -89,6 +97,6 @@ def _put_together_alone(worker: Worker) -> None:
         return
     try:
         if not worker.folder.complete:
-            put_together(worker.folder, finished_shards(worker.folder))
+            assemble_results(worker.folder, finished_shards(worker.folder))
     finally:
         lease.release()

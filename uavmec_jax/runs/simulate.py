@@ -6,13 +6,14 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from uavmec_jax.agents.networks import n_weights
+from uavmec_jax.agents.networks import count_weights
 from uavmec_jax.agents.registry import ALGORITHMS
 from uavmec_jax.runs.checkpoints import interval_s
-from uavmec_jax.runs.folder import Durability
-from uavmec_jax.runs.run_plan import Plan
-from uavmec_jax.studies.population import n_agents, parts
-from uavmec_jax.studies.schema import TRACED_PARAMS, Study
+from uavmec_jax.runs.options import RunOptions
+from uavmec_jax.runs.run_plan import RunPlan
+from uavmec_jax.studies.axes import TRACED_PARAMS
+from uavmec_jax.studies.population import n_agents, split_by_algorithm
+from uavmec_jax.studies.schema import Study
 
 # Measured on two cores of a laptop-sized machine; see results/simulation.
 _START_S = 4.0
@@ -70,11 +71,11 @@ class Simulation:
 
 def simulate(
     study: Study,
-    plan: Plan,
+    plan: RunPlan,
     *,
     speed: float | Mapping[str, float],
     devices: int,
-    durability: Durability | None = None,
+    options: RunOptions | None = None,
 ) -> Simulation:
     """Wall time, disk and memory of a run, without running it.
 
@@ -83,23 +84,23 @@ def simulate(
         plan: how it is cut.
         speed: training steps per second of one device; or by algorithm.
         devices: of all machines together.
-        durability: how it would be kept.
+        options: how it would be kept.
     """
-    durability = durability or Durability()
+    options = options or RunOptions()
     kept = 0.0
     training = other = shards = results = 0.0
-    groups = max(cut.groups for cut in plan.blocks.values())
+    groups = max(cut.groups for cut in plan.partitions.values())
     workers = max(min(devices // groups, len(plan.shards)), 1)
-    for part in parts(study):
-        cut, steps = plan.blocks[part.algorithm], plan.steps[part.algorithm]
-        turns = math.ceil(cut.count / workers)
+    for part in split_by_algorithm(study):
+        cut, steps = plan.partitions[part.algorithm], plan.steps[part.algorithm]
+        turns = math.ceil(cut.shards / workers)
         if steps:
             own = speed[part.algorithm] if isinstance(speed, Mapping) else speed
-            shard_s = cut.size * steps / (own * min(cut.groups, devices))
+            shard_s = cut.shard_size * steps / (own * min(cut.groups, devices))
             training += turns * shard_s
-            kept = max(kept, cut.bytes * _generations(durability, cut.bytes, shard_s))
+            kept = max(kept, cut.shard_bytes * _generations(options, cut.shard_bytes, shard_s))
             other += _COMPILE_S["training"]
-        judged = turns * cut.size / plan.members[part.algorithm]
+        judged = turns * cut.shard_size / plan.members[part.algorithm]
         draws = min(part.evaluation.planner_draws, part.evaluation.draws)
         if part.evaluation.planners:
             other += _COMPILE_S["planners"] + _PLANNING_S * _scenarios(part) * draws * min(judged, 1.0)
@@ -107,7 +108,7 @@ def simulate(
             other += _COMPILE_S["evaluation"]
         shards += plan.members[part.algorithm] * sum(_agent_bytes(part))
         results += plan.members[part.algorithm] * _agent_bytes(part)[0]
-    largest = max(cut.bytes for cut in plan.blocks.values())
+    largest = max(cut.shard_bytes for cut in plan.partitions.values())
     return Simulation(
         training_s=training,
         other_s=_START_S + other,
@@ -119,11 +120,11 @@ def simulate(
     )
 
 
-def _generations(durability: Durability, size: float, shard_s: float) -> int:
-    """Snapshots of a shard that lie side by side: two, and one being written, if there is time for so many."""
-    if durability.snapshot == "weights":
+def _generations(options: RunOptions, size: float, shard_s: float) -> int:
+    """Checkpoints of a shard that lie side by side: two, and one being written, if there is time for so many."""
+    if options.checkpoint == "weights":
         return 0
-    return min(int(shard_s / interval_s(durability.snapshot_every_s, durability.snapshot_share, size)), 3)
+    return min(int(shard_s / interval_s(options.checkpoint_every_s, options.checkpoint_share, size)), 3)
 
 
 def _scenarios(study: Study) -> int:
@@ -146,4 +147,4 @@ def _agent_bytes(study: Study) -> tuple[int, int]:
     spec = declared.spec_of(getattr(study, study.algorithm).model_dump(), n_devices=n)
     looks = study.steps // settings.validate_every + 1
     episodes += 2 * (settings.draws + 1)
-    return 2 * 4 * n_weights(spec.network, spec.words) + 1000, episode * episodes + 4 * 5 * looks
+    return 2 * 4 * count_weights(spec.network, spec.obs_size) + 1000, episode * episodes + 4 * 5 * looks

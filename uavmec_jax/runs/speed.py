@@ -13,13 +13,13 @@ from jax.sharding import Mesh, PartitionSpec
 from uavmec_jax.env.dynamics import Cause, State, initial_state
 from uavmec_jax.env.layout import sample_layout
 from uavmec_jax.env.params import Params
-from uavmec_jax.env.scenario import Scenario, advance, draw_volumes, make_scenario, restart_if
+from uavmec_jax.env.scenario import Scenario, advance, auto_reset, draw_volumes, make_scenario
 from uavmec_jax.studies.population import make_agents, make_algorithm, n_agents, validation_keys
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.training import host
-from uavmec_jax.training.partition import plan_blocks
-from uavmec_jax.training.population import take
-from uavmec_jax.training.programs import Programs, make_mesh, on_devices
+from uavmec_jax.training.partition import partition_population
+from uavmec_jax.training.population import take_padded
+from uavmec_jax.training.programs import Programs, make_mesh, put_on_mesh
 
 
 def random_steps(scenario: Scenario, state: State, key: Any, steps: Any) -> tuple[State, Any]:
@@ -31,7 +31,7 @@ def random_steps(scenario: Scenario, state: State, key: Any, steps: Any) -> tupl
         uniform = jax.random.uniform(jax.random.fold_in(key, i), (n + 1,))
         action = jnp.minimum((uniform[n] * n).astype(jnp.int32), n - 1)
         after, reward, outcome = advance(scenario, state, action, draw_volumes(scenario.params, uniform[:n]))
-        return restart_if(outcome.cause != Cause.NONE, scenario, after), total + reward
+        return auto_reset(outcome.cause != Cause.NONE, scenario, after), total + reward
 
     return jax.lax.fori_loop(0, steps, step, (state, jnp.float32(0)))
 
@@ -73,11 +73,11 @@ def training_speed(
     start: int | None = None,
     prepare: Callable[[Any], Any] = lambda state: state,
 ) -> dict[str, float]:
-    """Environment steps per second of training a study's population, block after block as in a real run.
+    """Environment steps per second of training a study's population, shard after shard as in a real run.
 
     Args:
         study: of one algorithm.
-        seconds: of measurement, for all blocks together.
+        seconds: of measurement, for all partition together.
         warm_up: iterations before the clock starts.
         start: iteration at which the clock starts; by default where the warm-up ended.
         prepare: applied to the state between the two, e.g. to fill a replay memory.
@@ -87,15 +87,15 @@ def training_speed(
     """
     algorithm, n = make_algorithm(study), n_agents(study)
     assert algorithm is not None
-    blocks = plan_blocks(n, algorithm.agent_bytes, host.free_memory())
-    mesh = make_mesh(blocks.devices)
+    partition = partition_population(n, algorithm.agent_bytes, host.free_memory())
+    mesh = make_mesh(partition.devices)
     everyone = (make_agents(study), validation_keys(study))
     tick = time.perf_counter()
-    programs = Programs.compile(algorithm, mesh, take(everyone, 0, blocks.size))
+    programs = Programs.compile(algorithm, mesh, take_padded(everyone, 0, partition.shard_size))
     compile_seconds = time.perf_counter() - tick
     chunk, rates = max(1, 1000 // algorithm.steps_per_iteration), []
-    for block in range(blocks.count):
-        agents, _ = on_devices(mesh, take(everyone, block * blocks.size, blocks.size))
+    for shard in range(partition.shards):
+        agents, _ = put_on_mesh(mesh, take_padded(everyone, shard * partition.shard_size, partition.shard_size))
         state = prepare(programs.update(agents, programs.init(agents), np.int32(0), np.int32(warm_up)))
         first = warm_up if start is None else start
 
@@ -104,9 +104,9 @@ def training_speed(
 
         state = train_chunk(state, first)  # into the caches
         chunks, begun = 0, time.perf_counter()
-        while chunks == 0 or time.perf_counter() - begun < seconds / blocks.count:
+        while chunks == 0 or time.perf_counter() - begun < seconds / partition.shards:
             chunks += 1
             state = train_chunk(state, first + chunks * chunk)
-        steps = chunks * chunk * algorithm.steps_per_iteration * min(blocks.size, n)
+        steps = chunks * chunk * algorithm.steps_per_iteration * min(partition.shard_size, n)
         rates.append(steps / (time.perf_counter() - begun))
     return {"steps_per_second": float(np.mean(rates)), "compile_seconds": compile_seconds}

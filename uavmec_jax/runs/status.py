@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from uavmec_jax.files.leases import named
+from uavmec_jax.files.leases import describe_holder
 from uavmec_jax.runs.folder import RunFolder
 
 
@@ -18,7 +18,7 @@ class Status:
         complete: whether the results have been put together.
         agents: in all.
         shards: state -> how many shards are in it: ``waiting``, ``running``, ``stopped``, ``failed``, ``done``.
-        steps, of_steps: environment steps made and wanted (scenarios, where nothing is trained).
+        steps, total_steps: environment steps made and wanted (scenarios, where nothing is trained).
         steps_per_second: of all workers together; 0 if nobody trains.
         seconds_left: at that speed, of training; ``None`` if nobody trains.
         disk_bytes: of the folder.
@@ -31,7 +31,7 @@ class Status:
     agents: int
     shards: dict[str, int]
     steps: int
-    of_steps: int
+    total_steps: int
     steps_per_second: float
     seconds_left: float | None
     disk_bytes: int
@@ -64,7 +64,7 @@ def run_status(directory: str | Path) -> Status:
             steps += int(facts.get("steps", 0))
         if state == "running":
             speed += float(facts.get("speed", 0.0))
-            workers.append(f"shard {shard.number}: {named(facts)}")
+            workers.append(f"shard {shard.number}: {describe_holder(facts)}")
     files = (file for file in folder.path.rglob("*") if file.is_file())
     return Status(
         directory=str(directory),
@@ -72,7 +72,7 @@ def run_status(directory: str | Path) -> Status:
         agents=plan.agents,
         shards=dict(counts),
         steps=steps,
-        of_steps=plan.work,
+        total_steps=plan.work,
         steps_per_second=speed,
         seconds_left=(plan.work - steps) / speed if speed else None,
         disk_bytes=sum(_size(file) for file in files),

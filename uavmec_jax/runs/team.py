@@ -9,20 +9,20 @@ from typing import Any
 
 from uavmec_jax.errors import StudyError
 from uavmec_jax.runs.folder import LOG, RunFolder
-from uavmec_jax.runs.signals import Stop
+from uavmec_jax.runs.signals import StopSignal
 from uavmec_jax.training.population import Progress
 
 _LOOK_S = 0.5
 
 
 def work_together(
-    folder: RunFolder, workers: int, stop: Stop, on_progress: Callable[[Progress], None], tell: Callable[..., Any]
+    folder: RunFolder, workers: int, stop: StopSignal, on_progress: Callable[[Progress], None], tell: Callable[..., Any]
 ) -> None:
     """Start workers and wait until all shards are over; if one dies, the others take over what it had.
 
     Raises:
         StudyError: all have died before the work was done.
-        Stopped: a signal came; it was passed on, and the workers have kept what they had.
+        Interrupted: a signal came; it was passed on, and the workers have kept what they had.
     """
     log = folder.path / LOG
     log.mkdir(parents=True, exist_ok=True)

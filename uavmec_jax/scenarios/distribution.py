@@ -1,4 +1,4 @@
-"""Studies of drawn scenarios: agents that play a fresh scenario in every episode, and how they are judged."""
+"""Distributions of scenarios in study files, and how a scenario differs from one."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any
@@ -8,21 +8,23 @@ import jax.numpy as jnp
 import numpy as np
 from pydantic import Field
 
-from uavmec_jax.env import hardware as tables
+from uavmec_jax.env import hardware
 from uavmec_jax.env.generator import ScenarioDistribution
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rewards import Reward
-from uavmec_jax.files.validation import settings_model
+from uavmec_jax.files.validation import from_array, model_from_dataclasses
 from uavmec_jax.traffic.evacuation import load_evacuation
 
-_Declared: Any = settings_model("Declared", ScenarioDistribution, leave_out=("params", "reward", "traffic_weights"))
+_Declared: Any = model_from_dataclasses(
+    "Declared", ScenarioDistribution, leave_out=("params", "reward", "traffic_weights")
+)
 
 
 class ScenarioSettings(_Declared):
-    """What scenarios are drawn from, as in a study file; see :class:`ScenarioDistribution`."""
+    """The table ``scenarios`` of a study file; see :class:`ScenarioDistribution`."""
 
-    places: Annotated[tuple[str, ...], Field(min_length=1)] = ("albany", "round_lake")
+    places: Annotated[tuple[str, ...], Field(min_length=1), from_array] = ("albany", "round_lake")
     """Simulated evacuations whose devices' traffic weights are resampled."""
 
 
@@ -71,8 +73,10 @@ def make_distribution(scenarios: Any, params: Params, reward: Reward, agents: in
     return ScenarioDistribution(params=params, reward=reward, **spread)
 
 
-def unlike(scenarios: Mapping[str, Any], trained: Mapping[str, Any], params: Params, layout: Layout) -> list[str]:
-    """In what a scenario lies outside a distribution: a line each.
+def out_of_distribution(
+    scenarios: Mapping[str, Any], trained: Mapping[str, Any], params: Params, layout: Layout
+) -> list[str]:
+    """Compare a scenario with a distribution: a line for each quantity that lies outside.
 
     Args:
         scenarios: the settings of the distribution, as plain data.
@@ -80,24 +84,9 @@ def unlike(scenarios: Mapping[str, Any], trained: Mapping[str, Any], params: Par
         params: of the scenario.
         layout: of the scenario.
     """
-    low, high = (trained["device_battery_range_j"][side] * scenarios["battery_factor"][side] for side in (0, 1))
-    own, hardware = jax.tree.map(np.asarray, layout), scenarios["hardware_factor"]
-    extent = float(np.max(np.ptp(np.concatenate([own.position, np.zeros((1, 2))]), axis=0)))
-    within = lambda table: (table.min() * hardware[0], table.max() * hardware[1])  # noqa: E731
-    of_uav = lambda name: tuple(trained[name] * factor for factor in scenarios["uav_factor"])  # noqa: E731
-    measured: dict[str, tuple[Any, tuple[float, float]]] = {
-        "devices": (len(own.capacity), tuple(scenarios["devices"])),
-        "extent in m": (extent, (0.0, max(scenarios["region_m"][1], *trained["region_m"]))),
-        "battery capacities in J": (own.capacity, (low, high)),
-        "standby powers in W": (own.standby_power, within(tables.STANDBY_POWER_W)),
-        "active powers in W": (own.active_power, within(tables.ACTIVE_POWER_W)),
-        "processing rates in bytes/s": (own.processing_rate, within(tables.PROCESSING_RATE_BYTES_S)),
-        "the UAV's battery in J": (params.uav_battery_j, of_uav("uav_battery_j")),
-        "the UAV's speed in m/s": (params.uav_speed_m_s, of_uav("uav_speed_m_s")),
-    }
     found = [
         f"{name}: {_span(values)}; it was trained on {_span(known)}"
-        for name, (values, known) in measured.items()
+        for name, (values, known) in _measured(scenarios, trained, params, layout).items()
         if np.min(values) < known[0] * (1 - 1e-6) or np.max(values) > known[1] * (1 + 1e-6)
     ]
     same = {name: getattr(params, name) for name in trained if name not in _DRAWN}
@@ -108,11 +97,32 @@ def unlike(scenarios: Mapping[str, Any], trained: Mapping[str, Any], params: Par
     ]
 
 
+def _measured(
+    scenarios: Mapping[str, Any], trained: Mapping[str, Any], params: Params, layout: Layout
+) -> dict[str, tuple[Any, tuple[float, float]]]:
+    """Each quantity that is drawn, with the range it was drawn from."""
+    low, high = (trained["device_battery_range_j"][side] * scenarios["battery_factor"][side] for side in (0, 1))
+    own, factors = jax.tree.map(np.asarray, layout), scenarios["hardware_factor"]
+    extent = float(np.max(np.ptp(np.concatenate([own.position, np.zeros((1, 2))]), axis=0)))
+    within = lambda table: (table.min() * factors[0], table.max() * factors[1])  # noqa: E731
+    of_uav = lambda name: tuple(trained[name] * factor for factor in scenarios["uav_factor"])  # noqa: E731
+    return {
+        "devices": (len(own.capacity), tuple(scenarios["devices"])),
+        "extent in m": (extent, (0.0, max(scenarios["region_m"][1], *trained["region_m"]))),
+        "battery capacities in J": (own.capacity, (low, high)),
+        "standby powers in W": (own.standby_power, within(hardware.STANDBY_POWER_W)),
+        "active powers in W": (own.active_power, within(hardware.ACTIVE_POWER_W)),
+        "processing rates in bytes/s": (own.processing_rate, within(hardware.PROCESSING_RATE_BYTES_S)),
+        "the UAV's battery in J": (params.uav_battery_j, of_uav("uav_battery_j")),
+        "the UAV's speed in m/s": (params.uav_speed_m_s, of_uav("uav_speed_m_s")),
+    }
+
+
 _DRAWN = ("n_devices", "region_m", "device_battery_range_j", "uav_battery_j", "uav_speed_m_s", "max_slots")
-"""Parameters that a distribution draws, that a layout overrules, or that do not matter."""
+"""Parameters that a distribution draws, that a layout overrides, or that do not matter."""
 
 
 def _span(values: Any) -> str:
-    """One number, or from where to where."""
+    """One number, or a range."""
     low, high = float(np.min(values)), float(np.max(values))
     return f"{low:,.6g}" if low == high else f"{low:,.6g} to {high:,.6g}"

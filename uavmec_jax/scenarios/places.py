@@ -12,7 +12,7 @@ from uavmec_jax.traffic.evacuation import Evacuation
 def on_place(
     layout: Layout, evacuation: Evacuation, *, moving: bool = False, scale_to_m: float | None = None
 ) -> Layout:
-    """A layout with its devices where those of an evacuation stand.
+    """Place the devices of a layout where those of an evacuation stand.
 
     Args:
         layout: hardware, batteries, power and communication of ``n`` devices.
@@ -21,7 +21,7 @@ def on_place(
         scale_to_m: see :meth:`Evacuation.local_position`.
     """
     traffic = Traffic(
-        weight=jnp.asarray(_weights(evacuation, moving)),
+        weight=jnp.asarray(traffic_weights(evacuation, moving)),
         window_s=jnp.float32(evacuation.meta["window_s"]),
         price=jnp.float32(0),
     )
@@ -29,6 +29,6 @@ def on_place(
     return replace(layout, position=position, traffic=traffic)
 
 
-def _weights(evacuation: Evacuation, moving: bool) -> np.ndarray:
-    """``[W, n]``: the weights of every window, or their mean alone."""
+def traffic_weights(evacuation: Evacuation, moving: bool) -> np.ndarray:
+    """Weights ``[W, n]`` of every window of an evacuation, or ``[1, n]``, their mean."""
     return evacuation.window_weight if moving else evacuation.weight[None]

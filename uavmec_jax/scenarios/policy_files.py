@@ -1,4 +1,4 @@
-"""Collections of trained weights with all that makes them policies: one file, versioned, checked, without pickle.
+"""Files of trained policies: weights with everything that makes them policies, versioned, checked, without pickle.
 
 A run leaves one collection of all its agents, ``weights.npz``; a policy saved on its own is a collection of one.
 """
@@ -18,7 +18,6 @@ from uavmec_jax.agents.algorithm import Algorithm
 from uavmec_jax.agents.registry import ALGORITHMS
 from uavmec_jax.errors import PolicyError
 from uavmec_jax.files.archives import read_checked, write_checked
-from uavmec_jax.files.validation import tuples
 from uavmec_jax.planning.observation import FEATURES
 
 SCHEMA = 1
@@ -29,7 +28,7 @@ WEIGHTS = "weights.npz"
 
 
 @dataclass(frozen=True)
-class Collection:
+class PolicyCollection:
     """Trained agents.
 
     Attributes:
@@ -72,17 +71,13 @@ class Collection:
         return ALGORITHMS[name].spec_of(self._settings(name), n_devices=self.n_devices)
 
     def _settings(self, name: str) -> dict[str, Any]:
-        """Settings of an algorithm, with the defaults of what an older version did not know."""
-        declared = ALGORITHMS[name]
-        spec = declared.spec()
-        return {one: getattr(spec, one) for one in declared.static} | tuples(self.settings[name])
+        """Settings of an algorithm; JSON has no tuples."""
+        return {key: tuple(value) if isinstance(value, list) else value for key, value in self.settings[name].items()}
 
     def hyper(self, name: str, agent: Mapping[str, Any]) -> Any:
         """The hyperparameters of one agent."""
-        values = dict(self.settings[name]) | dict(agent)
-        declared = ALGORITHMS[name]
-        known = vars(declared.hyper())  # what an older version did not know had no effect then, as its default has now
-        return declared.hyper(**{one: values.get(one, known[one]) for one in declared.traced})
+        values, declared = dict(self.settings[name]) | dict(agent), ALGORITHMS[name]
+        return declared.hyper(**{key: values[key] for key in declared.traced})
 
     def pick(self, axes: Mapping[str, Any]) -> tuple[str, int]:
         """The algorithm and the place of the one agent that has the given values on its axes.
@@ -106,21 +101,21 @@ class Collection:
         raise PolicyError(f"{len(found)} agents have {asked}; say which: they differ in {', '.join(differ)}")
 
 
-def sees_all(settings: Mapping[str, Any]) -> bool:
+def observes_devices(settings: Mapping[str, Any]) -> bool:
     """Whether an algorithm's policies see the full observation, and so play layouts of any number of devices."""
     return settings.get("observation") == "full"
 
 
-def write_collection(path: Path, collection: Collection) -> None:
+def write_policies(path: Path, collection: PolicyCollection) -> None:
     """Write a collection, whole or not at all."""
     facts = {name: getattr(collection, name) for name in ("settings", "n_devices", "agents")}
     facts |= {"drawn": collection.drawn} if collection.drawn else {}
-    if any(sees_all(settings) for settings in collection.settings.values()):
+    if any(observes_devices(settings) for settings in collection.settings.values()):
         facts["features"] = [feature.name for feature in FEATURES]
     write_checked(path, SCHEMA, facts, collection.weights)
 
 
-def read_collection(path: Path) -> Collection:
+def read_policies(path: Path) -> PolicyCollection:
     """Read and check a collection.
 
     Raises:
@@ -133,16 +128,16 @@ def read_collection(path: Path) -> Collection:
         raise PolicyError(
             f"{path}: its policies see other features of a device than those of this version; train again"
         )
-    found = Collection(facts["settings"], facts["n_devices"], facts["agents"], weights, facts.get("drawn", {}))
+    found = PolicyCollection(facts["settings"], facts["n_devices"], facts["agents"], weights, facts.get("drawn", {}))
     _check_shapes(path, found)
     return found
 
 
-def _check_shapes(path: Path, collection: Collection) -> None:
+def _check_shapes(path: Path, collection: PolicyCollection) -> None:
     """The weights are those of the networks that the settings describe (another version may have had others)."""
     for name, agents in collection.agents.items():
         try:
-            wanted = _shapes(collection, name)
+            expectation = _shapes(collection, name)
         except (KeyError, TypeError, ValueError) as error:
             raise PolicyError(f"{path}: its {name} is not one that this version knows: {error}") from None
         for which in {key.split("/")[1] for key in collection.weights if key.startswith(f"{name}/")}:
@@ -152,17 +147,17 @@ def _check_shapes(path: Path, collection: Collection) -> None:
                 for key, leaf in collection.weights.items()
                 if key.startswith(prefix)
             }
-            if found != {key: (len(agents), *shape) for key, shape in wanted}:
+            if found != {key: (len(agents), *shape) for key, shape in expectation}:
                 raise PolicyError(f"{path}: its weights do not fit its {name} network of this version")
 
 
-def _shapes(collection: Collection, name: str) -> Iterable[tuple[str, tuple[int, ...]]]:
+def _shapes(collection: PolicyCollection, name: str) -> Iterable[tuple[str, tuple[int, ...]]]:
     spec = collection.spec(name)
-    made: Any = jax.eval_shape(spec.network.init, jax.random.key(0), jnp.zeros((1, spec.words)))
+    made: Any = jax.eval_shape(spec.network.init, jax.random.key(0), jnp.zeros((1, spec.obs_size)))
     return [(key, leaf.shape) for key, leaf in traverse_util.flatten_dict(made, sep="/").items()]
 
 
-def of_one(collection: Collection, name: str, place: int, which: str) -> Collection:
+def select_agent(collection: PolicyCollection, name: str, place: int, which: str) -> PolicyCollection:
     """The collection of one agent and one kind of weights."""
     prefix = f"{name}/{which}/"
     return dataclasses.replace(

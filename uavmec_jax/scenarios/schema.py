@@ -4,20 +4,16 @@ from typing import Annotated
 
 from pydantic import Field
 
-from uavmec_jax.files.validation import Strict
+from uavmec_jax.files.validation import StrictModel, from_array
 from uavmec_jax.scenarios.settings import ParamsSettings
 
 _Power = Annotated[float, Field(ge=0)]
-
-
 _Longitude = Annotated[float, Field(ge=-180, le=180)]
-
-
 _Latitude = Annotated[float, Field(ge=-89, le=89)]
 
 
-class Device(Strict):
-    """One line of an inventory; units in the names, one of ``x_m, y_m`` and ``lon, lat``."""
+class Device(StrictModel):
+    """One device: units in the names; either ``x_m, y_m`` or ``lon, lat``."""
 
     name: Annotated[str, Field(min_length=1, max_length=80)]
     x_m: float | None = None
@@ -25,9 +21,9 @@ class Device(Strict):
     lon: _Longitude | None = None
     lat: _Latitude | None = None
     type: str | None = None
-    """A name in :data:`tables.DEVICE_TYPES`; another one needs the three numbers below."""
+    """A name in :data:`hardware.DEVICE_TYPES`; any other needs the three numbers below."""
     task: str | None = None
-    """A name in :data:`tables.TASKS`."""
+    """A name in :data:`hardware.TASKS`."""
     standby_power_w: _Power | None = None
     active_power_w: _Power | None = None
     processing_rate_bytes_s: Annotated[float, Field(gt=0)] | None = None
@@ -36,11 +32,11 @@ class Device(Strict):
     comms: bool = False
 
 
-class InventoryFile(Strict):
-    """What a layout file holds."""
+class ScenarioFile(StrictModel):
+    """A scenario file."""
 
     name: str = ""
-    origin: tuple[_Longitude, _Latitude] | None = None
+    origin: Annotated[tuple[_Longitude, _Latitude] | None, from_array] = None
     """Longitude and latitude of the corner x_m = y_m = 0."""
     params: ParamsSettings = ParamsSettings()
-    device: tuple[Device, ...] = ()
+    device: Annotated[tuple[Device, ...], from_array] = ()

@@ -3,9 +3,9 @@
 from typing import Any
 
 from uavmec_jax.env.params import Params
-from uavmec_jax.files.validation import settings_model
+from uavmec_jax.files.validation import model_from_dataclasses
 
-ParamsSettings: Any = settings_model("ParamsSettings", Params)
+ParamsSettings: Any = model_from_dataclasses("ParamsSettings", Params)
 
 
 def check_ranges(settings: Any, where: str) -> None:

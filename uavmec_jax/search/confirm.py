@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from uavmec_jax.runs.run import run_or_resume
-from uavmec_jax.search.search import Found, best_study
+from uavmec_jax.search.search import SearchResult, best_study
 from uavmec_jax.studies.compare import Side
 from uavmec_jax.studies.study import load_study
 from uavmec_jax.training.population import Progress
@@ -14,7 +14,7 @@ OWN, BEST = "own", "best"
 
 
 def confirm(
-    found: Found,
+    found: SearchResult,
     directory: str | Path,
     *,
     command: str | None = None,

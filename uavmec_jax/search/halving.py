@@ -1,4 +1,4 @@
-"""One batch of trials: a population of trials x towns in which, rung after rung, only the best go on."""
+"""Successive halving within one batch: a population of trials x scenarios in which, rung after rung, only the best go on."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,11 +14,11 @@ from uavmec_jax.agents.registry import ALGORITHMS
 from uavmec_jax.env.rewards import make_reward
 from uavmec_jax.errors import StudyError
 from uavmec_jax.search.space import REWARD, Space, reward_with
-from uavmec_jax.studies.evaluation import judge_learned
+from uavmec_jax.studies.evaluation import evaluate_learned
 from uavmec_jax.studies.population import (
-    Who,
+    AgentId,
     evaluation_keys,
-    identities,
+    make_agent_ids,
     make_agents,
     make_algorithm,
     validation_keys,
@@ -26,8 +26,8 @@ from uavmec_jax.studies.population import (
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.studies.statistics import mean_interval
 from uavmec_jax.training import host
-from uavmec_jax.training.partition import Blocks, PopulationTooLargeError, plan_blocks
-from uavmec_jax.training.population import take
+from uavmec_jax.training.partition import Partition, PopulationTooLargeError, partition_population
+from uavmec_jax.training.population import take_padded
 from uavmec_jax.training.regroup import regroup
 from uavmec_jax.training.training import Trainer, Training, Validation
 
@@ -36,12 +36,12 @@ Values = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TrialOutcome:
     """How a trial did.
 
     Attributes:
-        value: of the objective; ``None`` if it was given up.
-        rungs: step of one agent -> mean validation lifetime of the best weights by then.
+        value: of the objective; ``None`` if the trial was pruned.
+        rungs: environment step of one agent -> mean validation lifetime of the best weights by then.
     """
 
     value: float | None
@@ -49,12 +49,12 @@ class Outcome:
 
 
 @dataclass
-class Brackets:
-    """Makes the batches of a search; programs are compiled once for each shape.
+class SuccessiveHalving:
+    """Runs the batches of a search; programs are compiled once for each shape.
 
     Attributes:
         space: of the search.
-        on_progress: told ``(share of the batch, trials that are left)``.
+        on_progress: called with ``(share of the batch that is done, trials that are left)``.
     """
 
     space: Space
@@ -63,39 +63,41 @@ class Brackets:
 
     @cached_property
     def study(self) -> Study:
-        """The study on the search's own towns."""
-        base, towns = self.space.base(), self.space.validation
-        cells = {"cells": [list(cell) for cell in towns.cells]} if towns.cells else {}
+        """The study on the search's own scenarios."""
+        base, own = self.space.base(), self.space.validation
+        cells = {"cells": [list(cell) for cell in own.cells]} if own.cells else {}
         kept = {name: base.axes[name] for name in ("powered", "connected", "cells") if name in base.axes and not cells}
-        seeds = list(range(towns.first_seed, towns.first_seed + towns.seeds))
-        evaluation = base.evaluation.model_copy(update={"draws": towns.draws})
+        seeds = list(range(own.first_seed, own.first_seed + own.seeds))
+        evaluation = base.evaluation.model_copy(update={"draws": own.draws})
         return base.model_copy(update={"axes": kept | cells | {"seeds": seeds}, "evaluation": evaluation})
 
     @cached_property
-    def who(self) -> Who:
-        """The agents of one trial: one on each town."""
-        return identities(self.study)
+    def agent_ids(self) -> list[AgentId]:
+        """Identities of the agents of one trial: one on each scenario."""
+        return make_agent_ids(self.study)
 
     @property
-    def towns(self) -> int:
+    def n_scenarios(self) -> int:
         """Agents of one trial."""
-        return len(self.who)
+        return len(self.agent_ids)
 
-    def run(self, trials: Sequence[Values]) -> list[Outcome]:
-        """Train and judge a batch. What shapes the program is the same for all of its trials.
+    def run(self, trials: Sequence[Values]) -> list[TrialOutcome]:
+        """Train and evaluate a batch, whose static settings are the same for all trials.
 
         Raises:
             StudyError: the batch does not fit in memory.
         """
         agents, keys, algorithm = self._population(trials)
-        trainer = self._trainer(trials[0], algorithm, agents, keys, len(trials) * self.towns)
-        size = trainer.blocks.size
-        trainings = [trainer.start(*take((agents, keys), block * size, size)) for block in range(trainer.blocks.count)]
+        trainer = self._trainer(trials[0], algorithm, agents, keys, len(trials) * self.n_scenarios)
+        size = trainer.partition.shard_size
+        trainings = [
+            trainer.start(*take_padded((agents, keys), shard * size, size)) for shard in range(trainer.partition.shards)
+        ]
         left = list(range(len(trials)))
         rungs: list[dict[int, float]] = [{} for _ in trials]
         for chunk in self._rungs(trainer):
-            self._advance(trainings, chunk, len(left))
-            scores = self._by_trial(_best_scores(trainings), len(left))
+            self._train_until(trainings, chunk, len(left))
+            scores = self._by_trial(np.concatenate([training.best_scores for training in trainings]), len(left))
             for trial, score in zip(left, scores, strict=True):
                 rungs[trial][trainings[0].steps] = float(score)
             if chunk < len(trainer.chunks):
@@ -104,15 +106,15 @@ class Brackets:
                 left = [left[k] for k in best]
                 trainings = regroup(trainings, self._members(best))
         agents = jax.tree.map(lambda leaf: leaf[self._members(left)], agents)
-        values = dict(zip(left, self._judged(agents, trainings, algorithm), strict=True))
-        return [Outcome(values.get(k), rungs[k]) for k in range(len(trials))]
+        values = dict(zip(left, self._objective(agents, trainings, algorithm), strict=True))
+        return [TrialOutcome(values.get(k), rungs[k]) for k in range(len(trials))]
 
     def _population(self, trials: Sequence[Values]) -> tuple[Agent, Any, Algorithm]:
-        """Trials x towns: agents, validation draws, and the algorithm of the batch."""
-        study = self._shaped(trials[0])
-        every = self.who * len(trials)
-        agents = make_agents(study, who=every)
-        per_agent = [trial for trial in trials for _ in self.who]
+        """Trials x scenarios: agents, validation draws, and the algorithm of the batch."""
+        study = self._with_static(trials[0])
+        agent_ids = self.agent_ids * len(trials)
+        agents = make_agents(study, agent_ids=agent_ids)
+        per_agent = [trial for trial in trials for _ in self.agent_ids]
         hyper = {
             name: jnp.asarray([trial[name] for trial in per_agent], getattr(agents.hyper, name).dtype)
             for name in vars(agents.hyper)
@@ -121,85 +123,77 @@ class Brackets:
         agents = replace(agents, hyper=replace(agents.hyper, **hyper))
         if any(key.startswith(REWARD) for key in trials[0]):
             rewards = [make_reward(reward_with(study, trial), study.guard) for trial in trials]
-            weights = jnp.repeat(jnp.stack([reward.weights for reward in rewards]), self.towns, axis=0)
+            weights = jnp.repeat(jnp.stack([reward.weights for reward in rewards]), self.n_scenarios, axis=0)
             scenario = replace(agents.scenario, reward=replace(agents.scenario.reward, weights=weights))
             agents = replace(agents, scenario=scenario)
         algorithm = make_algorithm(study)
         assert algorithm is not None
-        return agents, validation_keys(study, every), algorithm
+        return agents, validation_keys(study, agent_ids), algorithm
 
-    def _shaped(self, trial: Values) -> Study:
-        """The study with a trial's settings of the kind that shapes the program."""
+    def _with_static(self, trial: Values) -> Study:
+        """The study with a trial's static settings."""
         name = self.study.algorithms[0]
         settings = getattr(self.study, name)
-        shape = {key: tuple(v) if isinstance(v, list) else v for key, v in trial.items() if hasattr(settings, key)}
-        return self.study.model_copy(update={name: settings.model_copy(update=shape)})
+        static = {key: tuple(v) if isinstance(v, list) else v for key, v in trial.items() if hasattr(settings, key)}
+        return self.study.model_copy(update={name: settings.model_copy(update=static)})
 
     def _trainer(self, trial: Values, algorithm: Algorithm, agents: Agent, keys: Any, n: int) -> Trainer:
-        """The programs for a shape: compiled for the first batch that has it."""
-        study = self._shaped(trial)
-        settings = getattr(study, study.algorithms[0])
-        shape = tuple(
-            (key, str(getattr(settings, key))) for key in sorted(trial) if key in ALGORITHMS[algorithm.name].static
-        )
-        blocks = self._blocks(algorithm, n)
-        if (known := self._trainers.get((shape, blocks.size))) is None:
+        """The programs of a shape, compiled for the first batch that has it."""
+        study = self._with_static(trial)
+        settings, static = getattr(study, study.algorithms[0]), ALGORITHMS[algorithm.name].static
+        shape = tuple((key, str(getattr(settings, key))) for key in sorted(trial) if key in static)
+        partition = self._partition(algorithm, n)
+        known = self._trainers.get((shape, partition.shard_size))
+        if known is None:
             validation = Validation(every=study.evaluation.validate_every, draws=study.evaluation.validation_draws)
-            members, draws = take((agents, keys), 0, blocks.size)
-            known = self._trainers[(shape, blocks.size)] = Trainer.compile(
-                algorithm, members, draws, validation, blocks
-            )
-        return replace(known, blocks=blocks)
+            members, draws = take_padded((agents, keys), 0, partition.shard_size)
+            known = Trainer.compile(algorithm, members, draws, validation, partition)
+            self._trainers[(shape, partition.shard_size)] = known
+        return replace(known, partition=partition)
 
-    def _blocks(self, algorithm: Algorithm, n: int) -> Blocks:
-        """A batch as equal blocks, all of which are in memory; half of it is for regrouping."""
+    def _partition(self, algorithm: Algorithm, n: int) -> Partition:
+        """A batch as equal shards, all of which are in memory, twice while they are regrouped."""
         try:
-            blocks = plan_blocks(n, algorithm.agent_bytes, host.free_memory())
+            partition = partition_population(n, algorithm.agent_bytes, host.free_memory())
         except PopulationTooLargeError as error:
             raise StudyError(f"{self.space.name}: {error}") from None
-        needed, free = 2 * blocks.count * blocks.bytes, host.free_memory()
+        needed, free = 2 * partition.shards * partition.shard_bytes, host.free_memory()
         if needed > free:
             raise StudyError(
                 f"{self.space.name}: batch is {self.space.batch}: {n} agents need {needed / 2**30:.1f} GiB, "
                 f"{free / 2**30:.1f} GiB are free; train fewer trials at a time, or fewer steps"
             )
-        return blocks
+        return partition
 
     def _rungs(self, trainer: Trainer) -> list[int]:
-        """Chunks at which trials are compared: the first looks after each rung, and the end."""
-        looks = [k + 1 for k, (_, _, is_look) in enumerate(trainer.chunks) if is_look]
-        wanted = [share * len(trainer.chunks) for share in sorted(self.space.halving.rungs)]
-        return sorted({min(look for look in looks if look >= chunk) for chunk in wanted} | {len(trainer.chunks)})
+        """Chunks at which trials are compared: the first validation after each rung, and the end."""
+        validations = [k + 1 for k, chunk in enumerate(trainer.chunks) if chunk.validates]
+        rungs = [share * len(trainer.chunks) for share in sorted(self.space.halving.rungs)]
+        return sorted({min(v for v in validations if v >= rung) for rung in rungs} | {len(trainer.chunks)})
 
-    def _advance(self, trainings: list[Training], chunk: int, left: int) -> None:
+    def _train_until(self, trainings: list[Training], chunk: int, left: int) -> None:
         total = len(trainings) * len(trainings[0].trainer.chunks)
         for training in trainings:
-            while training.done < chunk:
-                training.advance()
-                self.on_progress(sum(one.done for one in trainings) / total, left)
+            for _ in training.run(until=chunk):
+                self.on_progress(sum(one.chunks_done for one in trainings) / total, left)
 
     def _by_trial(self, values: np.ndarray, n: int) -> np.ndarray:
-        """``[trials]`` means over the towns."""
-        return values[: n * self.towns].reshape(n, self.towns).mean(axis=1)
+        """``[trials]`` means over the scenarios."""
+        return values[: n * self.n_scenarios].reshape(n, self.n_scenarios).mean(axis=1)
 
     def _members(self, trials: Sequence[int] | np.ndarray) -> np.ndarray:
         """Places of the agents of some trials in the population."""
-        return (np.asarray(trials)[:, None] * self.towns + np.arange(self.towns)).ravel()
+        return (np.asarray(trials)[:, None] * self.n_scenarios + np.arange(self.n_scenarios)).ravel()
 
-    def _judged(self, agents: Agent, trainings: list[Training], algorithm: Algorithm) -> list[float]:
-        """The objective of trials that are trained to the end, on draws that no look has seen."""
-        n, size = agents.key.shape[0], trainings[0].trainer.blocks.size
-        keys = evaluation_keys(self.study, self.who * (n // self.towns))
+    def _objective(self, agents: Agent, trainings: list[Training], algorithm: Algorithm) -> list[float]:
+        """The objective of trials that are trained to the end, on draws that no validation has used."""
+        n, size = agents.key.shape[0], trainings[0].trainer.partition.shard_size
+        keys = evaluation_keys(self.study, self.agent_ids * (n // self.n_scenarios))
         sizes = [min(size, n - k * size) for k in range(len(trainings))]
         pieces = [training.weights(size)["best"] for training, size in zip(trainings, sizes, strict=True)]
         best = jax.tree.map(lambda *leaves: np.concatenate(leaves), *pieces)
-        lifetimes = judge_learned(algorithm, agents, keys, {"best": best})["best"].mean_lifetime
-        per_trial = lifetimes.reshape(-1, self.towns)
+        lifetimes = evaluate_learned(algorithm, agents, keys, {"best": best})["best"].mean_lifetime
+        per_trial = lifetimes.reshape(-1, self.n_scenarios)
         if self.space.objective == "mean":
             return [float(mean) for mean in per_trial.mean(axis=1)]
         return [mean_interval(own)[1] for own in per_trial]
-
-
-def _best_scores(trainings: list[Training]) -> np.ndarray:
-    """``[A]`` the best validation score of every agent so far."""
-    return np.concatenate([training.best_scores for training in trainings])

@@ -12,16 +12,16 @@ import pandas as pd
 
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files.writing import write_text
-from uavmec_jax.search.halving import Brackets, Outcome
+from uavmec_jax.search.halving import SuccessiveHalving, TrialOutcome
 from uavmec_jax.search.space import (
     Choices,
     Range,
     Space,
+    baseline_settings,
     digest,
     holds,
     outer,
     outer_combinations,
-    own_settings,
     settings_of,
 )
 from uavmec_jax.studies.study import load_study, study_toml
@@ -36,18 +36,18 @@ _BATCH = "batch"
 
 
 @dataclass(frozen=True)
-class News:
+class SearchProgress:
     """How far a search is: trials that are over, of how many; of the batch at hand its share and the trials left in it."""
 
     trials: int
-    of_trials: int
+    total_trials: int
     share: float
     left: int
     best: float
 
 
 @dataclass(frozen=True)
-class Found:
+class SearchResult:
     """What a search found.
 
     Attributes:
@@ -74,9 +74,13 @@ class Found:
         return float(self.trials.loc[self.trials["number"] == 0, "value"].iloc[0])
 
 
-def search(
-    space: Space, directory: str | Path, *, command: str = "", on_progress: Callable[[News], None] = lambda _: None
-) -> Found:
+def run_search(
+    space: Space,
+    directory: str | Path,
+    *,
+    command: str = "",
+    on_progress: Callable[[SearchProgress], None] = lambda _: None,
+) -> SearchResult:
     """Search, or go on with a search that was stopped; a batch that was under way is made again, with the same trials.
 
     Args:
@@ -95,7 +99,7 @@ def search(
     path.mkdir(parents=True, exist_ok=True)
     write_text(path / FACTS, json.dumps({"space": space.model_dump(mode="json"), "command": command} | host.describe()))
     trials = _open(optuna, path, space)
-    brackets = Brackets(space)
+    halving = SuccessiveHalving(space)
     batches = math.ceil(space.trials / space.batch)
     for batch in range(batches):
         members = _proposed(optuna, trials, space, batch)
@@ -103,10 +107,10 @@ def search(
             continue
 
         def report(share: float, left: int, over: int = batch * space.batch) -> None:
-            on_progress(News(over, space.trials, share, left, _best_value(trials)))
+            on_progress(SearchProgress(over, space.trials, share, left, _best_value(trials)))
 
-        brackets.on_progress = report
-        outcomes = brackets.run([_values(space, trial.params) for trial in members])
+        halving.on_progress = report
+        outcomes = halving.run([_values(space, trial.params) for trial in members])
         for trial, outcome in zip(members, outcomes, strict=True):
             if not trial.state.is_finished():
                 _tell(optuna, trials, trial, outcome)
@@ -116,7 +120,7 @@ def search(
     return found
 
 
-def best_study(found: Found) -> Any:
+def best_study(found: SearchResult) -> Any:
     """The study with the best settings."""
     study = load_study(found.space.study, settings_of(found.space, found.best))
     return study.model_copy(update={"name": f"{found.space.name}-best"})
@@ -135,19 +139,11 @@ def _check_directory(path: Path, space: Space) -> None:
     if not path.exists() or not any(path.iterdir()):
         return
     try:
-        before = Space.model_validate(
-            _tupled(json.loads((path / FACTS).read_text(encoding="utf-8"))["space"]), strict=True
-        )
+        before = Space.model_validate(json.loads((path / FACTS).read_text(encoding="utf-8"))["space"], strict=True)
     except (OSError, ValueError, KeyError, TypeError):
         raise StudyError(f"{path}: is not empty and holds no search; give another folder with --out") from None
     if digest(before) != digest(space):
         raise StudyError(f"{path}: holds another search; give another folder with --out")
-
-
-def _tupled(space: dict[str, Any]) -> dict[str, Any]:
-    """JSON has no tuples."""
-    cells = space["validation"]["cells"]
-    return space | {"validation": space["validation"] | {"cells": [tuple(cell) for cell in cells] if cells else None}}
 
 
 def _open(optuna: Any, path: Path, space: Space) -> "optuna.Study":
@@ -162,7 +158,7 @@ def _open(optuna: Any, path: Path, space: Space) -> "optuna.Study":
     except DatabaseError as error:
         raise StudyError(f"{path / DATABASE}: cannot be read: {error.orig!s}") from None
     if not trials.get_trials(deepcopy=False):
-        own = own_settings(space)
+        own = baseline_settings(space)
         trials.enqueue_trial({key: _told(own[key]) for key, values in space.space.items() if holds(values, own[key])})
     return trials
 
@@ -174,7 +170,7 @@ def _proposed(optuna: Any, trials: "optuna.Study", space: Space, batch: int) -> 
     what it would have proposed. The outer settings are the same for all of a batch: the first batches have one
     combination each, until all were tried; later ones have what the sampler chooses for their first trial.
     """
-    names, combinations, own = outer(space), outer_combinations(space), own_settings(space)
+    names, combinations, own = outer(space), outer_combinations(space), baseline_settings(space)
     size = min(space.batch, space.trials - batch * space.batch)
     members = [trial for trial in trials.get_trials(deepcopy=False) if trial.user_attrs.get(_BATCH) == batch]
     while len(members) < size:
@@ -221,7 +217,7 @@ def _values(space: Space, params: Mapping[str, Any]) -> dict[str, Any]:
     return {key: json.loads(params[key]) if key in lists else params[key] for key in space.space}
 
 
-def _tell(optuna: Any, trials: "optuna.Study", trial: Any, outcome: Outcome) -> None:
+def _tell(optuna: Any, trials: "optuna.Study", trial: Any, outcome: TrialOutcome) -> None:
     live = optuna.trial.Trial(trials, trial._trial_id)
     for step, value in outcome.rungs.items():
         live.report(value, step)
@@ -236,7 +232,7 @@ def _best_value(trials: "optuna.Study") -> float:
     return max((value for value in values if value is not None), default=float("nan"))
 
 
-def _found(optuna: Any, trials: "optuna.Study", space: Space) -> Found:
+def _found(optuna: Any, trials: "optuna.Study", space: Space) -> SearchResult:
     rows = []
     for trial in trials.get_trials(deepcopy=False)[: space.trials]:
         if trial.state.is_finished():
@@ -250,4 +246,4 @@ def _found(optuna: Any, trials: "optuna.Study", space: Space) -> Found:
             importance = optuna.importance.get_param_importances(trials, evaluator=evaluator)
         except (ValueError, RuntimeError):  # fewer than two trials that are complete, or all alike
             importance = {}
-    return Found(space, pd.DataFrame(rows), dict(importance), _values(space, trials.best_params))
+    return SearchResult(space, pd.DataFrame(rows), dict(importance), _values(space, trials.best_params))

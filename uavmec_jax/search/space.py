@@ -15,7 +15,7 @@ from uavmec_jax.agents.registry import ALGORITHMS
 from uavmec_jax.env.rewards import REWARDS, TERMS
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files.reading import parse_toml, read_text
-from uavmec_jax.files.validation import Strict, nearest, one_line, wanted
+from uavmec_jax.files.validation import StrictModel, describe_error, expectation, from_array, suggest
 from uavmec_jax.studies.population import seeds_of
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.studies.study import load_study
@@ -26,7 +26,7 @@ REWARD = "reward."
 """Before the name of a term, for its weight in the reward."""
 
 
-class Range(Strict):
+class Range(StrictModel):
     """Numbers between two bounds."""
 
     low: float | int
@@ -35,51 +35,51 @@ class Range(Strict):
     """Equal shares for equal ratios."""
 
 
-class Choices(Strict):
+class Choices(StrictModel):
     """Some values."""
 
     choices: Annotated[list[Any], Field(min_length=2)]
 
 
-class Towns(Strict):
-    """Where trials are judged: towns of their own, never those that the study reports."""
+class ValidationScenarios(StrictModel):
+    """Where trials are evaluated: scenarios of their own, never those that the study reports."""
 
     seeds: Annotated[int, Field(ge=1, le=1000)] = 2
     first_seed: Annotated[int, Field(ge=0, lt=2**30)] = 1_000_000
-    cells: list[tuple[int, int]] | None = None
+    cells: list[Annotated[tuple[int, int], from_array]] | None = None
     """Pairs of powered and connected devices; by default those of the study."""
     draws: Annotated[int, Field(ge=1, le=1000)] = 32
 
 
-class Halving(Strict):
+class Halving(StrictModel):
     """Successive halving (Jamieson and Talwalkar, 2016) within a batch."""
 
     rungs: list[Annotated[float, Field(gt=0, lt=1)]] = Field(default_factory=list)
-    """Shares of the training at which the worst trials are given up; none gives up nobody."""
+    """Shares of the training at which the worst trials are pruned; by default none are."""
     keep: Annotated[float, Field(gt=0, lt=1)] = 0.5
-    """Share of the trials that goes on."""
+    """Share of the trials that continue."""
 
 
-class Space(Strict):
+class Space(StrictModel):
     """A search."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=80)] = "search"
     study: str
     """Whose settings are searched: a shipped study or a file."""
     change: dict[str, Any] = Field(default_factory=dict)
-    """Settings of the study that are others here, by dotted names."""
+    """Settings of the study that differ in the search, by dotted names."""
     trials: Annotated[int, Field(ge=1, le=100_000)] = 64
     batch: Annotated[int, Field(ge=1, le=4096)] = 16
     """Trials that train together."""
     objective: Literal["mean", "low"] = "mean"
-    """Mean lifetime of the best weights, or the lower end of its 95 % interval over the towns."""
+    """Mean lifetime of the best weights, or the lower end of its 95 % interval over the scenarios."""
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
-    validation: Towns = Towns()
+    validation: ValidationScenarios = ValidationScenarios()
     halving: Halving = Halving()
     confirm_seeds: Annotated[int, Field(ge=0, le=1000)] = 5
-    """Towns of the study (its seeds, from 0) on which the best settings are then held against the study's own; 0: none."""
+    """Seeds of the study, from 0, on which the best settings are compared with the study's own; 0 for none."""
     space: dict[str, Range | Choices]
-    """A hyperparameter, ``reward.TERM``, or, of choices, a setting that shapes the program."""
+    """Hyperparameters, ``reward.TERM``, or, with choices, static settings -> values to search."""
 
     def base(self) -> Study:
         """The study with this search's changes.
@@ -111,18 +111,15 @@ def load_space(name_or_path: str, overrides: Mapping[str, Any] | None = None) ->
     if name_or_path in library:
         text = library[name_or_path].read_text(encoding="utf-8")
     elif not Path(name_or_path).is_file():
-        known = nearest(Path(name_or_path).stem, library)
+        known = suggest(Path(name_or_path).stem, library)
         raise StudyError(f"{name_or_path}: neither a file of a search space nor a shipped one; {known}")
     else:
         text = read_text(Path(name_or_path), StudyError)
     data = {"name": Path(name_or_path).stem} | parse_toml(text, name_or_path, StudyError) | dict(overrides or {})
-    if isinstance(data.get("validation"), dict) and isinstance(data["validation"].get("cells"), list):
-        cells = data["validation"]["cells"]
-        data["validation"] = data["validation"] | {"cells": [tuple(c) if isinstance(c, list) else c for c in cells]}
     try:
         space = Space.model_validate(data)
     except pydantic.ValidationError as error:
-        raise StudyError(one_line(name_or_path, error, Space)) from None
+        raise StudyError(describe_error(name_or_path, error, Space)) from None
     _check(name_or_path, space)
     return space
 
@@ -140,7 +137,7 @@ def _check(source: str, space: Space) -> None:
             known = key in declared.traced or key in declared.static
         if not known:
             names = (*declared.traced, *declared.static, *(REWARD + term for term in TERMS))
-            raise StudyError(f"{where} is not a setting of {name}; {nearest(key, names)}")
+            raise StudyError(f"{where} is not a setting of {name}; {suggest(key, names)}")
         if isinstance(wanted_values, Range):
             _check_range(where, key, wanted_values, declared.static)
         for value in values_at_the_edge(wanted_values):
@@ -174,7 +171,7 @@ def _check_value(where: str, settings: Any, key: str, value: Any) -> None:
     try:
         settings(**{key: int(value) if whole else tuple(value) if isinstance(value, list) else value})
     except pydantic.ValidationError as error:
-        raise StudyError(f"{where} has {value!r}; {wanted(error.errors()[0])}") from None
+        raise StudyError(f"{where} has {value!r}; {expectation(error.errors()[0])}") from None
 
 
 def values_at_the_edge(values: Range | Choices) -> list[Any]:
@@ -196,13 +193,13 @@ def outer(space: Space) -> list[str]:
 def outer_combinations(space: Space) -> list[dict[str, Any]]:
     """Every combination of what shapes the program; the study's own first, if it is one of them."""
     names = outer(space)
-    own = {key: value for key, value in own_settings(space).items() if key in names}
+    own = {key: value for key, value in baseline_settings(space).items() if key in names}
     choices = [values.choices for key in names if isinstance(values := space.space[key], Choices)]
     found = [dict(zip(names, combination, strict=True)) for combination in itertools.product(*choices)]
     return sorted(found, key=lambda combination: combination != own) if names else []
 
 
-def own_settings(space: Space) -> dict[str, Any]:
+def baseline_settings(space: Space) -> dict[str, Any]:
     """The study's own values of what is searched."""
     study = space.base()
     settings = getattr(study, study.algorithms[0])

@@ -14,18 +14,18 @@ from jaxtyping import Array, Key
 
 from uavmec_jax.agents.algorithm import Agent, Algorithm
 from uavmec_jax.env.dynamics import Cause
-from uavmec_jax.env.generator import ScenarioDistribution, scenario_of_draw
+from uavmec_jax.env.generator import ScenarioDistribution, scenario_from_draw
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
-from uavmec_jax.env.rollout import Episode, play_draws
+from uavmec_jax.env.rollout import Episode, rollout_draws
 from uavmec_jax.env.scenario import Scenario
 from uavmec_jax.planning.beam import horizon
-from uavmec_jax.planning.parallel import bound_all, play_beam, play_heuristics, play_rollout
+from uavmec_jax.planning.parallel import beam_episodes, bound_scenarios, heuristic_episodes, rollout_planner_episodes
 from uavmec_jax.studies.schema import Evaluation
 
 
 @dataclass(frozen=True)
-class Judgement:
+class EvaluationResult:
     """How one policy did on ``A`` agents' scenarios; ``D`` held-out draws and the fixed one behind them.
 
     Attributes:
@@ -44,19 +44,19 @@ class Judgement:
         return self.lifetime[:, :-1].mean(axis=1)
 
     @property
-    def often_first(self) -> np.ndarray:
+    def first_failure_share(self) -> np.ndarray:
         """``[A, n]`` how often each device is the first to fail, over the held-out draws."""
         return self.first_failure[:, :-1].mean(axis=1)
 
     def columns(self, policy: str) -> dict[str, Any]:
-        """The judgement as columns of the tidy table, named after the policy."""
+        """The evaluation_result as columns of the tidy table, named after the policy."""
         prefix = policy.replace("-", "_")
-        often = self.often_first
+        often = self.first_failure_share
         fixed = self.first_failure[:, -1]
         return {
             f"{prefix}_lifetime": self.mean_lifetime,
             f"{prefix}_lifetime_fixed": self.lifetime[:, -1],
-            f"{prefix}_cause": [commonest(causes) for causes in self.cause[:, :-1]],
+            f"{prefix}_cause": [most_common_cause(causes) for causes in self.cause[:, :-1]],
             f"{prefix}_cause_fixed": [Cause(cause).name.lower() for cause in self.cause[:, -1]],
             f"{prefix}_first_device": [device_number(row) for row in often],
             f"{prefix}_first_share": often.max(axis=1),
@@ -64,7 +64,7 @@ class Judgement:
         }
 
 
-def commonest(causes: np.ndarray) -> str:
+def most_common_cause(causes: np.ndarray) -> str:
     """Name of the most frequent cause."""
     return Cause(int(np.bincount(causes).argmax())).name.lower()
 
@@ -74,9 +74,9 @@ def device_number(share: np.ndarray) -> int:
     return int(share.argmax()) + 1 if share.max() > 0 else 0
 
 
-def judge_learned(
+def evaluate_learned(
     algorithm: Algorithm, agents: Agent, keys: Key[Array, "A D"], weights: Mapping[str, Any]
-) -> dict[str, Judgement]:
+) -> dict[str, EvaluationResult]:
     """Play every agent's learned policies on its scenario.
 
     Args:
@@ -85,26 +85,28 @@ def judge_learned(
         keys: ``[A, D + 1]`` volume draws, from :func:`uavmec_jax.studies.study.evaluation_keys`.
         weights: name -> trained weights, leaves ``[A, ...]``.
     """
-    return {name: judgement(_play_learned(algorithm, agents, keys, trained)) for name, trained in weights.items()}
+    return {
+        name: evaluation_result(_play_learned(algorithm, agents, keys, trained)) for name, trained in weights.items()
+    }
 
 
-def judge_heuristics(agents: Agent, keys: Key[Array, "A D"], names: Iterable[str]) -> dict[str, Judgement]:
+def evaluate_heuristics(agents: Agent, keys: Key[Array, "A D"], names: Iterable[str]) -> dict[str, EvaluationResult]:
     """Play heuristics, by their names in :data:`HEURISTICS`, on every agent's scenario and ``[A, D + 1]`` draws."""
     names = tuple(names)
     if not names:
         return {}
     if isinstance(agents.scenario, ScenarioDistribution):
-        params, layouts, flat = one_by_one(agents.scenario, keys)
-        played = play_heuristics(names, params, layouts, flat[:, None])
+        params, layouts, flat = flatten_draws(agents.scenario, keys)
+        played = heuristic_episodes(names, params, layouts, flat[:, None])
         played = jax.tree.map(lambda leaf: leaf.reshape(len(names), *keys.shape, *leaf.shape[3:]), played)
     else:
-        played = play_heuristics(names, agents.scenario.params, agents.scenario.layout, keys)
-    return {name: judgement(jax.tree.map(lambda leaf, k=k: leaf[k], played)) for k, name in enumerate(names)}
+        played = heuristic_episodes(names, agents.scenario.params, agents.scenario.layout, keys)
+    return {name: evaluation_result(jax.tree.map(lambda leaf, k=k: leaf[k], played)) for k, name in enumerate(names)}
 
 
-def judgement(episode: Episode) -> Judgement:
-    """Episodes, leaves ``[A, D + 1, ...]``, as a judgement."""
-    return Judgement(
+def evaluation_result(episode: Episode) -> EvaluationResult:
+    """Episodes, leaves ``[A, D + 1, ...]``, as a evaluation_result."""
+    return EvaluationResult(
         lifetime=np.asarray(episode.length),
         cause=np.asarray(episode.cause, np.int8),
         first_failure=np.asarray(episode.first_failure),
@@ -112,7 +114,7 @@ def judgement(episode: Episode) -> Judgement:
 
 
 @dataclass(frozen=True)
-class PlannedJudgement:
+class PlannerResult:
     """How a planner did on the first ``P`` held-out draws of ``A`` agents' scenarios.
 
     Attributes:
@@ -126,9 +128,9 @@ class PlannedJudgement:
     first_failure: np.ndarray | None = None
 
 
-def judge_planners(
+def evaluate_planners(
     agents: Agent, keys: Key[Array, "A D"], settings: Evaluation, lifetimes: list[np.ndarray]
-) -> dict[str, PlannedJudgement]:
+) -> dict[str, PlannerResult]:
     """Play the planners, and bound what any policy can reach, on the first held-out draws.
 
     Args:
@@ -139,25 +141,27 @@ def judge_planners(
     """
     draws = min(settings.planner_draws, keys.shape[1])
     shape = (keys.shape[0], draws)
-    params, layouts, keys = one_by_one(agents.scenario, keys[:, :draws])
+    params, layouts, keys = flatten_draws(agents.scenario, keys[:, :draws])
     slots = horizon(params, layouts)
     judged = {}
     if "rollout" in settings.planners:
         judged["rollout"] = _planned(
-            play_rollout(params, layouts, keys, slots=slots, samples=settings.rollout_samples)[1], shape
+            rollout_planner_episodes(params, layouts, keys, slots=slots, samples=settings.rollout_samples)[1], shape
         )
     if "beam" in settings.planners:
-        judged["beam"] = _planned(play_beam(params, layouts, keys, slots=slots, width=settings.beam_width)[1], shape)
+        judged["beam"] = _planned(
+            beam_episodes(params, layouts, keys, slots=slots, width=settings.beam_width)[1], shape
+        )
     if "bound" in settings.planners:
-        lifetimes = [*lifetimes, *(judgement.lifetime for judgement in judged.values())]
+        lifetimes = [*lifetimes, *(evaluation_result.lifetime for evaluation_result in judged.values())]
         reached = np.max([np.ones(shape), *(life[:, :draws] for life in lifetimes)], axis=0)
-        found = bound_all(params, layouts, keys, reached.reshape(-1), slots=slots)
-        judged["bound"] = PlannedJudgement(lifetime=found.reshape(shape))
+        found = bound_scenarios(params, layouts, keys, reached.reshape(-1), slots=slots)
+        judged["bound"] = PlannerResult(lifetime=found.reshape(shape))
     return judged
 
 
-def _planned(episodes: Episode, shape: tuple[int, int]) -> PlannedJudgement:
-    return PlannedJudgement(
+def _planned(episodes: Episode, shape: tuple[int, int]) -> PlannerResult:
+    return PlannerResult(
         lifetime=np.asarray(episodes.length).reshape(shape),
         cause=np.asarray(episodes.cause, np.int8).reshape(shape),
         first_failure=np.asarray(episodes.first_failure).reshape(*shape, -1),
@@ -165,27 +169,27 @@ def _planned(episodes: Episode, shape: tuple[int, int]) -> PlannedJudgement:
 
 
 def planned_columns(
-    judgements: Mapping[str, Judgement], planned: Mapping[str, PlannedJudgement]
+    evaluation_results: Mapping[str, EvaluationResult], planned: Mapping[str, PlannerResult]
 ) -> dict[str, np.ndarray | list]:
     """Columns of the tidy table: mean lifetimes of everyone on the planners' draws, and who fails first under them."""
     if not planned:
         return {}
     draws = next(iter(planned.values())).lifetime.shape[1]
     columns: dict[str, np.ndarray | list] = {}
-    everyone: Mapping[str, Judgement | PlannedJudgement] = {**judgements, **planned}
+    everyone: Mapping[str, EvaluationResult | PlannerResult] = {**evaluation_results, **planned}
     for name, anyone in everyone.items():
         columns[f"{name.replace('-', '_')}_planned"] = anyone.lifetime[:, :draws].mean(axis=1)
     for name, judged in planned.items():
         if judged.cause is not None and judged.first_failure is not None:
             often = judged.first_failure.mean(axis=1)
-            columns[f"{name}_cause"] = [commonest(causes) for causes in judged.cause]
+            columns[f"{name}_cause"] = [most_common_cause(causes) for causes in judged.cause]
             columns[f"{name}_first_device"] = [device_number(row) for row in often]
             columns[f"{name}_first_share"] = often.max(axis=1)
     return columns
 
 
 @dataclass(frozen=True)
-class Distinct:
+class DistinctScenarios:
     """Which of ``A`` agents play the same scenario and draws, so that what nobody learned is played once for all of them.
 
     Attributes:
@@ -197,7 +201,7 @@ class Distinct:
     scenario: np.ndarray
 
     @classmethod
-    def of(cls, played: pd.DataFrame) -> "Distinct":
+    def of(cls, played: pd.DataFrame) -> "DistinctScenarios":
         """From the columns that say what is played, one row per agent."""
         scenario = played.groupby(list(played), sort=False).ngroup().to_numpy()
         return cls(first=np.unique(scenario, return_index=True)[1], scenario=scenario)
@@ -208,17 +212,17 @@ class Distinct:
         np.maximum.at(found, self.scenario, lifetimes)
         return found
 
-    def to_agents(self, judgement: Any) -> Any:
-        """A judgement of ``S`` scenarios as one of ``A`` agents."""
-        leaves = {name: leaf for name, leaf in vars(judgement).items() if leaf is not None}
-        return replace(judgement, **{name: leaf[self.scenario] for name, leaf in leaves.items()})
+    def to_agents(self, evaluation_result: Any) -> Any:
+        """A evaluation_result of ``S`` scenarios as one of ``A`` agents."""
+        leaves = {name: leaf for name, leaf in vars(evaluation_result).items() if leaf is not None}
+        return replace(evaluation_result, **{name: leaf[self.scenario] for name, leaf in leaves.items()})
 
 
-def judge_all(
+def evaluate_all(
     agents: Agent,
     keys: Key[Array, "A D"],
-    learned: dict[str, Judgement],
-    distinct: Distinct,
+    learned: dict[str, EvaluationResult],
+    distinct: DistinctScenarios,
     settings: Evaluation,
 ) -> tuple[dict[str, Any], dict[str, np.ndarray], float]:
     """Judge heuristics and planners beside the learned policies.
@@ -226,7 +230,7 @@ def judge_all(
     Args:
         agents: leaves ``[A, ...]``.
         keys: ``[A, D + 1]`` volume draws.
-        learned: from :func:`judge_learned`.
+        learned: from :func:`evaluate_learned`.
         distinct: which agents play the same.
         settings: who plays.
 
@@ -234,37 +238,39 @@ def judge_all(
         Columns of the tidy table, every episode by ``policy/field``, and the seconds that the planners took.
     """
     once, draws = jax.tree.map(lambda leaf: leaf[distinct.first], (agents, keys))
-    heuristics = judge_heuristics(once, draws, settings.baselines)
+    heuristics = evaluate_heuristics(once, draws, settings.baselines)
     reached = [distinct.longest(judged.lifetime) for judged in learned.values()]
     reached += [judged.lifetime for judged in heuristics.values()]
     started = time.perf_counter()
     planned = {
         name: distinct.to_agents(judged)
-        for name, judged in judge_planners(once, draws[:, :-1], settings, reached).items()
+        for name, judged in evaluate_planners(once, draws[:, :-1], settings, reached).items()
     }
     planning = time.perf_counter() - started
-    judgements = learned | {name: distinct.to_agents(judged) for name, judged in heuristics.items()}
-    columns = {name: values for policy, judged in judgements.items() for name, values in judged.columns(policy).items()}
-    everyone: dict[str, Judgement | PlannedJudgement] = {**judgements, **planned}
+    evaluation_results = learned | {name: distinct.to_agents(judged) for name, judged in heuristics.items()}
+    columns = {
+        name: values for policy, judged in evaluation_results.items() for name, values in judged.columns(policy).items()
+    }
+    everyone: dict[str, EvaluationResult | PlannerResult] = {**evaluation_results, **planned}
     evaluation = {
         f"{policy.replace('-', '_')}/{name}": values
         for policy, anyone in everyone.items()
         for name, values in asdict(anyone).items()
         if values is not None
     }
-    return columns | planned_columns(judgements, planned), evaluation, planning
+    return columns | planned_columns(evaluation_results, planned), evaluation, planning
 
 
 # Jitted here and not inside `judge`, so that the blocks of a run share one compilation.
 @partial(jax.jit, static_argnames="algorithm")
 def _play_learned(algorithm: Algorithm, agents: Agent, keys: Key[Array, "A D"], weights: Any) -> Episode:
     def one(agent: Agent, draws: Key[Array, " D"], weights: Any) -> Episode:
-        return play_draws(algorithm.policy(agent.hyper, weights), agent.scenario, draws)
+        return rollout_draws(algorithm.policy(agent.hyper, weights), agent.scenario, draws)
 
     return jax.vmap(one)(agents, keys, weights)
 
 
-def one_by_one(
+def flatten_draws(
     plays: Scenario | ScenarioDistribution, keys: Key[Array, "A D"]
 ) -> tuple[Params, Layout, Key[Array, " AD"]]:
     """What ``A`` agents play in each of ``D`` draws, and the draws, leaves ``[A * D, ...]``.
@@ -281,4 +287,4 @@ def one_by_one(
     return each.params, each.layout, keys.reshape(-1)
 
 
-_draw_all = jax.jit(jax.vmap(jax.vmap(scenario_of_draw, (None, 0))))
+_draw_all = jax.jit(jax.vmap(jax.vmap(scenario_from_draw, (None, 0))))

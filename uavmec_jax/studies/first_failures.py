@@ -1,13 +1,14 @@
-"""Who fails first in an evacuation, and whether the reward keeps it from being a device in high traffic (Table 7)."""
+"""AgentIds fails first in an evacuation, and whether the reward keeps it from being a device in high traffic (Table 7)."""
 
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from uavmec_jax.studies.axes import TRAFFIC_WEIGHTS
 from uavmec_jax.studies.population import cell_axes
 from uavmec_jax.studies.results import Results
-from uavmec_jax.studies.schema import PLANNERS, TRAFFIC_WEIGHTS, Study
+from uavmec_jax.studies.schema import PLANNERS, Study
 from uavmec_jax.studies.statistics import mean_interval, sign_test
 
 ALL_PLACES = "all places"

@@ -9,7 +9,7 @@ import numpy as np
 
 from uavmec_jax.env.layout import Layout, Traffic
 from uavmec_jax.errors import StudyError
-from uavmec_jax.scenarios.places import _weights
+from uavmec_jax.scenarios.places import traffic_weights
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.traffic.evacuation import Evacuation, load_evacuation
 
@@ -51,7 +51,7 @@ def onto_places(layouts: Layout, agents: Sequence[Mapping[str, Any]], study: Stu
     if not evacuations:
         return layouts
     own = [evacuations[agent.get("place", study.place)] for agent in agents]
-    weights = [_weights(evacuation, study.traffic == "moving") for evacuation in own]
+    weights = [traffic_weights(evacuation, study.traffic == "moving") for evacuation in own]
     windows = max(map(len, weights))  # the last window lasts
     padded = [np.pad(weight, ((0, windows - len(weight)), (0, 0)), mode="edge") for weight in weights]
     traffic = Traffic(

@@ -13,16 +13,16 @@ import pandas as pd
 from flax import traverse_util
 
 from uavmec_jax.files.writing import write_arrays, write_text
-from uavmec_jax.scenarios.policy_files import WEIGHTS, Collection, write_collection
+from uavmec_jax.scenarios.policy_files import WEIGHTS, PolicyCollection, write_policies
 from uavmec_jax.studies.evaluation import device_number
 from uavmec_jax.studies.population import cell_axes
 from uavmec_jax.studies.schema import PLANNERS, Study
-from uavmec_jax.studies.shard_result import Finished
+from uavmec_jax.studies.shard_result import ShardResult
 from uavmec_jax.studies.statistics import mean_interval
 from uavmec_jax.studies.study import study_toml
 
-SCHEMA = 2
-"""Version of the run folder. In version 1 curves and weights did not name their algorithm: it was the DQN."""
+SCHEMA = 3
+"""Version of the run folder."""
 
 STUDY, RUN, AGENTS, CURVES, EVALUATION = "study.toml", "run.json", "agents.csv", "curves.npz", "evaluation.npz"
 
@@ -35,7 +35,7 @@ class Results:
         study: the resolved study.
         run: what ``run.json`` holds: versions, hardware, command, seeds, times, speed.
         agents: tidy table, one row per finished agent.
-        curves: per algorithm, of its agents: ``chunk_steps [C]``, ``episode_length [A, C]``, ``look_steps [L]``,
+        curves: per algorithm, of its agents: ``chunk_steps [C]``, ``episode_length [A, C]``, ``validation_steps [L]``,
             ``validation [A, L]``.
         evaluation: per policy ``<name>/lifetime [A, D + 1]``, ``/cause``, ``/first_failure [A, D + 1, n]``; of the
             planners ``[A, P]`` and ``[A, P, n]``, the bound has lifetimes only.
@@ -73,7 +73,7 @@ class Results:
         return [name for name in ("best", "last") if {name, "oldest_first"} <= set(self.policies)]
 
     @classmethod
-    def of(cls, study: Study, label: Mapping[str, Any], shards: Iterable[Finished], agents: int) -> "Results":
+    def of(cls, study: Study, label: Mapping[str, Any], shards: Iterable[ShardResult], agents: int) -> "Results":
         """Put finished shards together, in the order of the plan.
 
         Args:
@@ -117,7 +117,7 @@ class Results:
                 "environment_steps": steps,
                 "training_steps_per_second": round(steps / seconds["train"]),
                 "validation_share": round(seconds["validate"] / (seconds["train"] + seconds["validate"]), 4),
-                "snapshot_share": round(seconds.get("snapshot", 0.0) / seconds["train"], 4),
+                "checkpoint_share": round(seconds.get("checkpoint", 0.0) / seconds["train"], 4),
             }
 
     def cells(self) -> pd.DataFrame:
@@ -153,7 +153,7 @@ class Results:
         tables = []
         for name, curves in self.curves.items():
             who = self._who(self.agents["algorithm"] == name if "algorithm" in self.agents else slice(None))
-            for curve, steps in (("episode_length", "chunk_steps"), ("validation", "look_steps")):
+            for curve, steps in (("episode_length", "chunk_steps"), ("validation", "validation_steps")):
                 n = len(curves[steps])
                 table = who.loc[who.index.repeat(n)].reset_index(drop=True)
                 tables.append(
@@ -199,12 +199,12 @@ class Results:
             if arrays:  # nothing was trained: no curves, no weights
                 write_arrays(directory / name, arrays)
         if self.weights:
-            write_collection(directory / WEIGHTS, self._collection())
+            write_policies(directory / WEIGHTS, self._collection())
         written = [directory / name for name in (STUDY, AGENTS, CURVES, EVALUATION, WEIGHTS)]
         digests = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in written if file.exists()}
         write_text(directory / RUN, json.dumps(self.run | {"sha256": digests}, indent=1) + "\n")
 
-    def _collection(self) -> Collection:
+    def _collection(self) -> PolicyCollection:
         """The weights with all that is needed to make policies of them."""
         agents: dict[str, list[dict[str, Any]]] = {name: [] for name in self.study.algorithms}
         axes = self.agents[["seed", *cell_axes(self.study)]]
@@ -238,10 +238,10 @@ def _drawn(study: Study) -> dict[str, Any]:
 
 def policy_collection(
     study: Study, agents: Mapping[str, list[dict[str, Any]]], weights: Mapping[str, Any]
-) -> Collection:
+) -> PolicyCollection:
     """Agents of a study as a collection of policies, ``weights`` by algorithm and kind: nested, or flat with ``/``."""
     place = {"place": study.place} if study.place else {}
-    return Collection(
+    return PolicyCollection(
         settings={name: getattr(study, name).model_dump(mode="json") for name in agents},
         n_devices=study.params.n_devices,
         agents={name: [dict(who) | place for who in own] for name, own in agents.items()},

@@ -10,7 +10,8 @@ from flax import traverse_util
 
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files.archives import load_arrays
-from uavmec_jax.scenarios.policy_files import WEIGHTS, read_collection
+from uavmec_jax.files.reading import read_text
+from uavmec_jax.scenarios.policy_files import WEIGHTS, read_policies
 from uavmec_jax.studies.results import AGENTS, CURVES, EVALUATION, RUN, SCHEMA, STUDY, Results
 from uavmec_jax.studies.study import load_study
 
@@ -22,41 +23,37 @@ def read_results(directory: Path) -> Results:
         StudyError: the folder holds none, a file of it is damaged, or it was written by another version.
     """
     run = _read_run(directory)
-    _check_manifest(directory, run)
+    _check_digests(directory, run)
     try:
         agents = _read_table(directory / AGENTS)
     except (OSError, ValueError) as error:
         raise StudyError(f"{directory}: cannot be read: {error}") from None
     study = load_study(directory / STUDY)
-    return Results(
-        study=study,
-        run=run,
-        agents=agents,
-        curves=_nested_curves(directory / CURVES, run.get("schema", 1)) if study.algorithms else {},
-        evaluation=load_arrays(directory / EVALUATION),
-    )
+    curves = traverse_util.unflatten_dict(load_arrays(directory / CURVES), sep="/") if study.algorithms else {}
+    return Results(study=study, run=run, agents=agents, curves=curves, evaluation=load_arrays(directory / EVALUATION))
 
 
 def _read_run(directory: Path) -> dict[str, Any]:
-    """What ``run.json`` holds."""
+    """The contents of ``run.json``."""
     path = directory / RUN
     if not path.is_file():
-        raise StudyError(f"{directory}: holds no run ({RUN} is not there)")
+        raise StudyError(f"{directory}: holds no run ({RUN} is missing)")
     try:
-        run: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        run: dict[str, Any] = json.loads(read_text(path, StudyError))
+        schema = run["schema"]
+    except (ValueError, KeyError, TypeError) as error:
         raise StudyError(f"{directory}: cannot be read: {error}") from None
-    if run.get("schema", SCHEMA) > SCHEMA:
-        raise StudyError(f"{path}: schema is {run['schema']}; this version reads up to {SCHEMA}")
+    if schema != SCHEMA:
+        raise StudyError(f"{path}: schema is {schema}; this version reads {SCHEMA}")
     return run
 
 
-def _check_manifest(directory: Path, run: dict[str, Any]) -> None:
-    """The files are those that the run left (runs of older versions do not say)."""
+def _check_digests(directory: Path, run: dict[str, Any]) -> None:
+    """Check that the files are those that the run wrote."""
     for name, digest in run.get("sha256", {}).items():
         path = directory / name
         if path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() != digest:
-            raise StudyError(f"{path}: cannot be read: was altered or damaged since the run left it")
+            raise StudyError(f"{path}: cannot be read: was altered or damaged since the run wrote it")
 
 
 def _read_table(path: Path) -> pd.DataFrame:
@@ -66,7 +63,7 @@ def _read_table(path: Path) -> pd.DataFrame:
 
 
 def load_weights(directory: str | Path, which: str = "best", algorithm: str | None = None) -> dict[str, Any]:
-    """Trained weights of a run as the networks take them, leaves ``[A, ...]`` in the order of ``agents.csv``.
+    """Load trained weights of a run as the networks take them, leaves ``[A, ...]`` in the order of ``agents.csv``.
 
     Args:
         directory: of the run.
@@ -76,10 +73,4 @@ def load_weights(directory: str | Path, which: str = "best", algorithm: str | No
     Raises:
         PolicyError: there are none, or the file is damaged.
     """
-    return read_collection(Path(directory) / WEIGHTS).weights_of(which, algorithm)
-
-
-def _nested_curves(path: Path, schema: int) -> dict[str, Any]:
-    """Curves by algorithm."""
-    nested: dict[str, Any] = traverse_util.unflatten_dict(load_arrays(path), sep="/")
-    return nested if schema > 1 else {"dqn": nested}
+    return read_policies(Path(directory) / WEIGHTS).weights_of(which, algorithm)

@@ -16,7 +16,7 @@ SHARD_SCHEMA = 1
 
 
 @dataclass(frozen=True)
-class Finished:
+class ShardResult:
     """A shard that is trained and judged.
 
     Attributes:
@@ -51,7 +51,7 @@ class Finished:
         write_checked(path, SHARD_SCHEMA, facts, arrays, compressed=False)
 
     @classmethod
-    def read(cls, path: Path) -> "Finished":
+    def read(cls, path: Path) -> "ShardResult":
         """What :meth:`write` wrote.
 
         Raises:

@@ -1,4 +1,4 @@
-"""Studies: read, check and change study files, and make the population that a study describes."""
+"""Study files: read, checked, changed and written."""
 
 from collections.abc import Mapping
 from importlib import resources
@@ -10,15 +10,15 @@ import tomli_w
 
 from uavmec_jax.agents.registry import ALGORITHMS
 from uavmec_jax.errors import StudyError
-from uavmec_jax.files.reading import parse_toml
-from uavmec_jax.files.validation import nearest, one_line, tuples
+from uavmec_jax.files.reading import parse_toml, read_text
+from uavmec_jax.files.validation import describe_error, suggest
 from uavmec_jax.studies.schema import Study
 
 _LIBRARY = resources.files("uavmec_jax.studies") / "library"
 
 
-def shipped() -> dict[str, Any]:
-    """Studies inside the package: name -> file."""
+def shipped_studies() -> dict[str, Any]:
+    """Return the studies inside the package: name -> file."""
     return {Path(file.name).stem: file for file in _LIBRARY.iterdir() if file.name.endswith(".toml")}
 
 
@@ -32,24 +32,21 @@ def load_study(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
     Raises:
         StudyError: the file is missing, is not TOML, or holds something that does not fit; one line.
     """
-    library = shipped()
+    library = shipped_studies()
     if str(name_or_path) in library:
         source, text = str(name_or_path), library[str(name_or_path)].read_text(encoding="utf-8")
     else:
         path = Path(name_or_path)
         source = str(path)
         if not path.is_file():
-            hint = nearest(path.stem, library) if path.suffix != ".toml" else "no such file"
+            hint = suggest(path.stem, library) if path.suffix != ".toml" else "no such file"
             raise StudyError(f"{source}: neither a study file nor a shipped study; {hint}")
-        try:
-            text = path.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise StudyError(f"{source}: cannot be read: {error}") from None
+        text = read_text(path, StudyError)
     return parse_study(text, source, overrides)
 
 
 def parse_study(text: str, source: str, overrides: Mapping[str, Any] | None = None) -> Study:
-    """A checked :class:`Study` from TOML text; ``source`` names it in messages.
+    """Check TOML text and make the :class:`Study`; ``source`` names it in messages.
 
     Raises:
         StudyError: as :func:`load_study`.
@@ -65,24 +62,12 @@ def parse_study(text: str, source: str, overrides: Mapping[str, Any] | None = No
         place[last] = value
     data.setdefault("name", Path(source).stem)
     try:
-        return Study.model_validate(_listed(data))
+        return Study.model_validate(data)
     except pydantic.ValidationError as error:
-        raise StudyError(one_line(source, error, Study)) from None
-
-
-def _listed(data: dict[str, Any]) -> dict[str, Any]:
-    """TOML arrays as tuples where a setting is a tuple (the checks do not convert)."""
-    settings = (*ALGORITHMS, "params", "evaluation", "scenarios")
-    return {key: tuples(value) if key in settings and isinstance(value, dict) else value for key, value in data.items()}
+        raise StudyError(describe_error(source, error, Study)) from None
 
 
 def study_toml(study: Study) -> str:
-    """The study, every setting resolved, as TOML that :func:`load_study` reads back to an equal study."""
+    """Write a study, every setting resolved, as TOML that :func:`load_study` reads back to an equal study."""
     silent = set(ALGORITHMS) - set(study.algorithms)
-    plain = study.model_dump(mode="json", exclude=silent, exclude_none=True)
-    return tomli_w.dumps(plain | {"params": _finite(study.params.model_dump())})
-
-
-def _finite(params: dict[str, Any]) -> dict[str, Any]:
-    """TOML knows infinity, JSON does not: take the plain values."""
-    return {key: list(value) if isinstance(value, tuple) else value for key, value in params.items()}
+    return tomli_w.dumps(study.model_dump(exclude=silent, exclude_none=True))

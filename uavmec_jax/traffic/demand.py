@@ -1,4 +1,4 @@
-"""Who drives where and when: Rayleigh loading of an evacuation, and through traffic."""
+"""AgentIds drives where and when: Rayleigh loading of an evacuation, and through traffic."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,7 +7,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from uavmec_jax.errors import TrafficError
-from uavmec_jax.files.validation import nearest
+from uavmec_jax.files.validation import suggest
 from uavmec_jax.traffic.network import HIGHWAYS, RESIDENTIAL, Road, RoadNetwork
 from uavmec_jax.traffic.place import Demand
 
@@ -96,7 +96,7 @@ def _exits(network: RoadNetwork, demand: Demand, name: str) -> tuple[list[Road],
     for given in demand.exits:
         into = [network.roads[given]] if given in network.roads else network.into(given)
         if not into:
-            hint = nearest(given, network.junctions)
+            hint = suggest(given, network.junctions)
             raise TrafficError(f"{name}: demand.exits has {given!r}, which is neither a road nor a junction; {hint}")
         found.append(into[0])
     return found, np.array(list(demand.exits.values()), float)
@@ -106,7 +106,7 @@ def _origins(network: RoadNetwork, demand: Demand, name: str, exits: set[str]) -
     for given in demand.origins:
         if given not in network.roads:
             raise TrafficError(
-                f"{name}: demand.origins has {given!r}, which is not a road; {nearest(given, network.roads)}"
+                f"{name}: demand.origins has {given!r}, which is not a road; {suggest(given, network.roads)}"
             )
     if demand.origins:
         return [network.roads[given] for given in demand.origins]
@@ -136,8 +136,8 @@ def write_trips(path: Path, routes: Routes, demand: Demand, duration_s: float, s
         (time, routes.origins[o].id, routes.exits[e].id, "r") for time, o, e in zip(leave, origin, chosen, strict=True)
     ]
     if routes.through_share.any():
-        whole = demand.warm_up_s + duration_s
-        times = rng.uniform(0, whole, rng.poisson(demand.through_per_hour * whole / 3600))
+        atomic = demand.warm_up_s + duration_s
+        times = rng.uniform(0, atomic, rng.poisson(demand.through_per_hour * atomic / 3600))
         pairs = rng.choice(routes.through_share.size, times.size, p=routes.through_share.ravel())
         for time, pair in zip(times, pairs, strict=True):
             t, e = divmod(int(pair), len(routes.exits))

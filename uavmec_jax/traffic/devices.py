@@ -3,7 +3,7 @@
 import numpy as np
 
 from uavmec_jax.errors import TrafficError
-from uavmec_jax.files.validation import nearest
+from uavmec_jax.files.validation import suggest
 from uavmec_jax.traffic.demand import Routes
 from uavmec_jax.traffic.network import RoadNetwork
 from uavmec_jax.traffic.place import Place, Placement, Site
@@ -57,7 +57,7 @@ def _of(site: Site, network: RoadNetwork, name: str) -> tuple[float, float]:
         assert site.y_m is not None
         return site.x_m, site.y_m
     if site.junction not in network.junctions:
-        hint = nearest(site.junction, network.junctions)
+        hint = suggest(site.junction, network.junctions)
         raise TrafficError(f"{name}: device {site.name!r}: junction is {site.junction!r}, which does not exist; {hint}")
     return network.junctions[site.junction]
 

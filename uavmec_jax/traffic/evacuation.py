@@ -8,7 +8,7 @@ import numpy as np
 
 from uavmec_jax.errors import TrafficError
 from uavmec_jax.files.archives import read_checked, write_checked
-from uavmec_jax.files.validation import nearest
+from uavmec_jax.files.validation import suggest
 from uavmec_jax.traffic.place import PLACES, shipped_places
 
 SCHEMA = 1
@@ -106,7 +106,7 @@ class Evacuation:
             )
 
     def save(self, path: str | Path) -> None:
-        """Write the file, whole or not at all."""
+        """Write the file, atomic or not at all."""
         arrays = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "meta"}
         write_checked(Path(path), SCHEMA, {"meta": self.meta}, arrays)
 
@@ -122,7 +122,7 @@ def load_evacuation(source: str | Path) -> Evacuation:
     if str(source) in shipped_places():
         path = Path(str(PLACES / str(source) / "evacuation.npz"))
     elif not path.exists() and not path.suffix:
-        raise TrafficError(f"{source}: neither a file nor a shipped place; {nearest(str(source), shipped_places())}")
+        raise TrafficError(f"{source}: neither a file nor a shipped place; {suggest(str(source), shipped_places())}")
     facts, arrays = read_checked(path, SCHEMA, "an evacuation", TrafficError)
     wanted = {field.name for field in fields(Evacuation)} - {"meta"}
     if set(arrays) != wanted or "meta" not in facts:

@@ -14,7 +14,7 @@ import numpy as np
 import platformdirs
 
 from uavmec_jax.errors import TrafficError
-from uavmec_jax.files.writing import whole
+from uavmec_jax.files.writing import atomic
 from uavmec_jax.traffic import sumo
 from uavmec_jax.traffic.checked_xml import Contents, checked_copy
 from uavmec_jax.traffic.place import NetworkSource
@@ -190,7 +190,7 @@ def _keep(built: Path, kept: Path) -> None:
     """Keep a network for the next time; where that cannot be, there is no next time."""
     with contextlib.suppress(OSError):
         kept.parent.mkdir(parents=True, exist_ok=True)
-        with whole(kept) as partial:
+        with atomic(kept) as partial:
             shutil.copyfile(built, partial)
 
 

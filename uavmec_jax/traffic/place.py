@@ -10,7 +10,7 @@ from pydantic import Field
 from uavmec_jax.env.params import MAX_DEVICES
 from uavmec_jax.errors import TrafficError
 from uavmec_jax.files.reading import parse_toml, read_text
-from uavmec_jax.files.validation import Strict, nearest, one_line
+from uavmec_jax.files.validation import StrictModel, describe_error, from_array, suggest
 
 _Positive = Annotated[float, Field(gt=0, le=1e7)]
 _NotNegative = Annotated[float, Field(ge=0, le=1e7)]
@@ -23,7 +23,7 @@ def shipped_places() -> tuple[str, ...]:
     return tuple(sorted(folder.name for folder in PLACES.iterdir() if folder.is_dir()))
 
 
-class NetworkSource(Strict):
+class NetworkSource(StrictModel):
     """Where the roads come from: one of the three kinds. Paths are relative to the file of the place."""
 
     nodes: str | None = None
@@ -32,7 +32,7 @@ class NetworkSource(Strict):
     types: str | None = None
     osm: str | None = None
     """An OpenStreetMap extract: .osm, .osm.gz or .osm.bz2."""
-    bbox: tuple[float, float, float, float] | None = None
+    bbox: Annotated[tuple[float, float, float, float] | None, from_array] = None
     """Part of the extract: west, south, east, north, in degrees."""
     net: str | None = None
     """A network that SUMO's netconvert has made."""
@@ -51,8 +51,8 @@ class NetworkSource(Strict):
         return self
 
 
-class Demand(Strict):
-    """Who drives, and when."""
+class Demand(StrictModel):
+    """AgentIds drives, and when."""
 
     vehicles: Annotated[int, Field(ge=1, le=1_000_000)] = 4000
     """Vehicles that are evacuated."""
@@ -62,7 +62,7 @@ class Demand(Strict):
     """Vehicles that pass through, from one highway end to another."""
     warm_up_s: _NotNegative = 600.0
     """Seconds of through traffic alone before the order to leave."""
-    origins: tuple[str, ...] = ()
+    origins: Annotated[tuple[str, ...], from_array] = ()
     """Edges where people live; by default the residential roads. Each is weighted by its length."""
     exits: dict[str, _Positive] = Field(default_factory=dict)
     """Junctions or edges where they leave -> weight; by default the highway ends, weighted by their lanes."""
@@ -70,7 +70,7 @@ class Demand(Strict):
     """Share of the drivers who look for a faster way while they drive."""
 
 
-class Simulation(Strict):
+class Simulation(StrictModel):
     """How the evacuation is simulated and averaged."""
 
     seeds: Annotated[int, Field(ge=1, le=1000)] = 5
@@ -78,7 +78,7 @@ class Simulation(Strict):
     """Seconds after the order to leave."""
     window_s: _Positive = 600.0
     """Densities are averaged over windows of this length."""
-    mean_s: tuple[_NotNegative, _Positive] = (0.0, 3600.0)
+    mean_s: Annotated[tuple[_NotNegative, _Positive], from_array] = (0.0, 3600.0)
     """Devices' weights are means over this part of the evacuation."""
     time_limit_s: _Positive = 900.0
     """Wall-clock seconds after which one simulation is stopped."""
@@ -96,7 +96,7 @@ class Simulation(Strict):
         first, last = self.windows
         if not 0 <= first < last:
             raise ValueError(
-                f"simulation.mean_s is {list(self.mean_s)}; give [from, to] with whole windows within the evacuation"
+                f"simulation.mean_s is {list(self.mean_s)}; give [from, to] with atomic windows within the evacuation"
             )
         return self
 
@@ -111,7 +111,7 @@ class Simulation(Strict):
         return round(self.mean_s[0] / self.window_s), min(round(self.mean_s[1] / self.window_s), self.n_windows)
 
 
-class Site(Strict):
+class Site(StrictModel):
     """One device of a file: at a junction, or at a point of the network in metres."""
 
     name: Annotated[str, Field(min_length=1, max_length=80)]
@@ -126,7 +126,7 @@ class Site(Strict):
         return self
 
 
-class Placement(Strict):
+class Placement(StrictModel):
     """Where devices go that no file places: junctions far from each other, some of them on the corridors."""
 
     count: Annotated[int, Field(ge=2, le=MAX_DEVICES)] = 12
@@ -138,7 +138,7 @@ class Placement(Strict):
     """Roads within this distance of a device count for its weight."""
 
 
-class Place(Strict):
+class Place(StrictModel):
     """A place and its evacuation."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=80)]
@@ -147,7 +147,7 @@ class Place(Strict):
     demand: Demand = Demand()
     simulation: Simulation = Simulation()
     devices: Placement = Placement()
-    device: tuple[Site, ...] = ()
+    device: Annotated[tuple[Site, ...], from_array] = ()
 
     @pydantic.model_validator(mode="after")
     def _check(self) -> "Place":
@@ -176,7 +176,7 @@ def load_place(source: str | Path, overrides: dict[str, Any] | None = None) -> t
         path = Path(source)
         if not path.is_file():
             raise TrafficError(
-                f"{source}: neither a file nor a shipped place; {nearest(str(source), shipped_places())}"
+                f"{source}: neither a file nor a shipped place; {suggest(str(source), shipped_places())}"
             )
     data = parse_toml(read_text(path, TrafficError), path, TrafficError)
     for table, settings in (overrides or {}).items():
@@ -192,13 +192,6 @@ def make_place(data: dict[str, Any], source: str) -> Place:
         TrafficError: something does not fit; one line.
     """
     try:
-        return Place.model_validate(_with_tuples(data))
+        return Place.model_validate(data)
     except pydantic.ValidationError as error:
-        raise TrafficError(one_line(source, error, Place)) from None
-
-
-def _with_tuples(value: Any) -> Any:
-    """Arrays of TOML as tuples, which is what the strict models want; whole numbers are numbers."""
-    if isinstance(value, dict):
-        return {name: _with_tuples(part) for name, part in value.items()}
-    return tuple(_with_tuples(part) for part in value) if isinstance(value, list) else value
+        raise TrafficError(describe_error(source, error, Place)) from None

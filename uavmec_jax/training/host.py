@@ -19,7 +19,7 @@ MEMORY_SHARE = 0.8
 """Share of the free memory that a run may plan with."""
 
 
-def use_every_core(share: tuple[int, int] | None = None) -> None:
+def use_all_cores(share: tuple[int, int] | None = None) -> None:
     """Make every CPU core a device of its own; call before JAX is first used.
 
     Agents are split over the devices, and each then works in its own core's cache: nearly twice as fast as one device

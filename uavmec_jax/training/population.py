@@ -1,4 +1,4 @@
-"""Many agents in lockstep, block after block."""
+"""Many agents in lockstep, shard after shard."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -9,57 +9,61 @@ import numpy as np
 from jaxtyping import Array, Key
 
 from uavmec_jax.agents.algorithm import Agent, Algorithm
-from uavmec_jax.training.partition import Blocks
-from uavmec_jax.training.training import TrainedBlock, Trainer, Validation
+from uavmec_jax.training.partition import Partition
+from uavmec_jax.training.training import TrainedShard, Trainer, Validation
 
 
 @dataclass(frozen=True)
 class Progress:
-    """One line of news from the host loop, after every chunk."""
+    """How far a population is, reported after every chunk.
 
-    block: int
+    Attributes:
+        shard: number of the shard in training.
+        steps: environment steps made by the whole population.
+        total_steps: of a whole training.
+        mean_episode_length: of the training episodes that ended in the chunk, slots.
+    """
+
+    shard: int
     steps: int
-    """Environment steps made by the whole population."""
-    of_steps: int
-    mean_length: float
-    """Mean length of the training episodes that ended in the chunk, slots."""
+    total_steps: int
+    mean_episode_length: float
 
 
-def take(tree: Any, first: int, size: int) -> Any:
-    """Leaves ``[size, ...]`` from ``first`` on; past the end the last one is repeated, to keep the shape."""
+def take_padded(tree: Any, first: int, size: int) -> Any:
+    """Take leaves ``[size, ...]`` from ``first`` on; past the end the last entry is repeated, to keep the shape."""
     n = jax.tree.leaves(tree)[0].shape[0]
     places = np.minimum(np.arange(first, first + size), n - 1)
     return jax.tree.map(lambda leaf: leaf[places], tree)
 
 
-def train(
+def train_population(
     algorithm: Algorithm,
     agents: Agent,
     validation_keys: Key[Array, "A D"],
     *,
     validation: Validation,
-    blocks: Blocks,
+    partition: Partition,
     on_progress: Callable[[Progress], None] = lambda _: None,
-) -> Iterator[TrainedBlock]:
-    """Train a population block by block, yielding each block as it is finished.
+) -> Iterator[TrainedShard]:
+    """Train a population shard by shard, yielding each shard when it is finished.
 
     Args:
         algorithm: what trains.
         agents: the population, leaves ``[A, ...]``.
-        validation_keys: ``[A, validation.draws]`` volume draws for the looks.
-        validation: the looks during training.
-        blocks: from :func:`uavmec_jax.training.partition.plan_blocks`.
-        on_progress: told after every chunk.
+        validation_keys: ``[A, validation.draws]`` volume draws for the validations.
+        validation: the validations during training.
+        partition: from :func:`uavmec_jax.training.partition.partition_population`.
+        on_progress: called after every chunk.
     """
-    n = validation_keys.shape[0]
-    members, keys = take((agents, validation_keys), 0, blocks.size)
-    trainer = Trainer.compile(algorithm, members, keys, validation, blocks)
-    for block in range(blocks.count):
-        first = block * blocks.size
-        real = min(blocks.size, n - first)
-        training = trainer.start(*take((agents, validation_keys), first, blocks.size))
-        while not training.finished:
-            training.advance()
-            done = first * algorithm.total_steps + real * training.steps
-            on_progress(Progress(block, done, n * algorithm.total_steps, training.mean_length))
-        yield training.trained(real)
+    n, size = validation_keys.shape[0], partition.shard_size
+    example_agents, example_keys = take_padded((agents, validation_keys), 0, size)
+    trainer = Trainer.compile(algorithm, example_agents, example_keys, validation, partition)
+    for shard in range(partition.shards):
+        first = shard * size
+        members = min(size, n - first)
+        training = trainer.start(*take_padded((agents, validation_keys), first, size))
+        for _ in training.run():
+            done = first * algorithm.total_steps + members * training.steps
+            on_progress(Progress(shard, done, n * algorithm.total_steps, training.mean_episode_length))
+        yield training.result(members)

@@ -1,4 +1,4 @@
-"""The compiled programs of a population: the agent axis split over the devices of a mesh, which never talk."""
+"""The compiled programs of a population: the agent axis is split over the devices of a mesh, which do not communicate."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from jaxtyping import Array, Key
 
 from uavmec_jax.agents.algorithm import AGENTS_AXIS, Agent, Algorithm
 from uavmec_jax.env.generator import ScenarioDistribution
-from uavmec_jax.env.rollout import Policy, priced_lives, returns, rollouts
+from uavmec_jax.env.rollout import Policy, priced_lifetimes, returns, rollouts
 from uavmec_jax.env.scenario import Scenario
 
 
@@ -32,7 +32,7 @@ def make_mesh(devices: int) -> Mesh:
     return Mesh(np.array(jax.local_devices()[:devices]), (AGENTS_AXIS,))
 
 
-def on_devices(mesh: Mesh, tree: Any) -> Any:
+def put_on_mesh(mesh: Mesh, tree: Any) -> Any:
     """Leaves ``[B, ...]`` split over the devices of a mesh."""
     return jax.device_put(tree, NamedSharding(mesh, PartitionSpec(AGENTS_AXIS)))
 
@@ -41,13 +41,13 @@ def on_devices(mesh: Mesh, tree: Any) -> Any:
 class Programs:
     """The compiled programs of one shape, the agent axis split over the devices of a mesh.
 
-    ``init(agents) -> state``; ``update(agents, state, first, last) -> state``, the old state is given away;
-    ``look(agents, keys, weights, best, step) -> (score [B], best)``, the old best is given away.
+    ``init(agents) -> state``; ``update(agents, state, first, last) -> state``, whose state is donated;
+    ``validate(agents, keys, weights, best, step) -> (score [B], best)``, whose best is donated.
     """
 
     init: Callable
     update: Callable
-    look: Callable
+    validate: Callable
 
     @classmethod
     def compile(cls, algorithm: Algorithm, mesh: Mesh, example: tuple[Agent, Key[Array, "B D"]]) -> "Programs":
@@ -73,11 +73,11 @@ class Programs:
         )
         options = _compiler_options()
         update = over_agents(algorithm.update, 2, 2, donate_argnums=1, compiler_options=options)
-        look = over_agents(partial(_look, algorithm), 4, 1, donate_argnums=3)
+        validate = over_agents(partial(_validate, algorithm), 4, 1, donate_argnums=3)
         return cls(
             init=init.lower(agents).compile(),
             update=update.lower(agents, state, 0, 1).compile(),
-            look=look.lower(agents, keys, state.weights, best, 0).compile(),
+            validate=validate.lower(agents, keys, state.weights, best, 0).compile(),
         )
 
 
@@ -86,8 +86,8 @@ def _compiler_options() -> dict[str, bool]:
     return {"xla_cpu_enable_concurrency_optimized_scheduler": False} if jax.default_backend() == "cpu" else {}
 
 
-def no_best_yet(state: Any) -> Best:
-    """Before the first look: the weights of a state, which any look betters."""
+def initial_best(state: Any) -> Best:
+    """Before the first validate: the weights of a state, which any validate betters."""
     size, sharding = state.diverged_at.shape[0], state.diverged_at.sharding
     return Best(
         weights=jax.tree.map(jnp.copy, state.weights),
@@ -96,7 +96,7 @@ def no_best_yet(state: Any) -> Best:
     )
 
 
-def _look(algorithm: Algorithm, agent: Agent, keys: Key[Array, " D"], weights: Any, best: Best, step: Any) -> Any:
+def _validate(algorithm: Algorithm, agent: Agent, keys: Key[Array, " D"], weights: Any, best: Best, step: Any) -> Any:
     """Validation score of the greedy policy of one agent, and the best so far (ties keep the earlier).
 
     The draws are of task volumes; of agents that play many scenarios, of a scenario each besides.
@@ -115,7 +115,7 @@ def _score(policy: Policy, plays: Scenario | ScenarioDistribution, keys: Key[Arr
     Where every draw is another scenario, lives are counted less the price of the first failure.
     """
     if isinstance(plays, ScenarioDistribution):
-        return jnp.mean(priced_lives(policy, plays, keys))
+        return jnp.mean(priced_lifetimes(policy, plays, keys))
     score = jnp.mean(rollouts(policy, plays.params, plays.layout, keys).length.astype(jnp.float32))
     if plays.layout.traffic is not None:
         paid = (plays.reward.traffic_bonus > 0) | (plays.reward.traffic_penalty > 0)

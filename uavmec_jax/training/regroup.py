@@ -1,4 +1,4 @@
-"""Some agents of a population go on without the others, in fewer blocks of the same shape: nothing is compiled anew."""
+"""Continue with some agents of a population in fewer shards of the same shape, without compiling anything anew."""
 
 from typing import Any
 
@@ -6,42 +6,46 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from uavmec_jax.training.programs import on_devices
-from uavmec_jax.training.training import Training, Wave
+from uavmec_jax.training.programs import put_on_mesh
+from uavmec_jax.training.training import GroupBatch, Training
 
 
 def regroup(trainings: list[Training], members: np.ndarray) -> list[Training]:
-    """Some agents of several blocks that are equally far, as fewer blocks of the same shape; the old ones are gone.
+    """Move some agents of several shards that are equally far into fewer shards of the same shape.
+
+    The old trainings must not be used any more.
 
     Args:
-        trainings: blocks of one population, in its order.
+        trainings: shards of one population, in its order.
         members: places in the population, in the order that they are to have.
     """
-    trainer, size = trainings[0].trainer, trainings[0].trainer.blocks.size
-    everyone = [(wave.agents, wave.keys, wave.state, wave.best) for training in trainings for wave in training.waves]
-    count = -(-len(members) // size)
-    places = members[np.minimum(np.arange(count * size), len(members) - 1)]
-    blocks = [places[k * size : (k + 1) * size] for k in range(count)]
-    per_wave = size // trainer.blocks.groups * trainer.mesh.size
+    trainer = trainings[0].trainer
+    size, per_batch = trainer.partition.shard_size, trainer.partition.group_size * trainer.mesh.size
+    shards = -(-len(members) // size)
+    places = members[np.minimum(np.arange(shards * size), len(members) - 1)].reshape(shards, size)
 
-    def taken(*leaves: Any) -> list[Any]:
-        whole = jnp.concatenate([jax.device_put(leaf, jax.local_devices()[0]) for leaf in leaves])
-        return [whole[block[k : k + per_wave]] for block in blocks for k in range(0, size, per_wave)]
+    def regrouped(*leaves: Any) -> list[Any]:
+        all_agents = jnp.concatenate([jax.device_put(leaf, jax.local_devices()[0]) for leaf in leaves])
+        return [all_agents[own[k : k + per_batch]] for own in places for k in range(0, size, per_batch)]
 
-    leaves, shape = jax.tree.flatten(everyone[0])
-    every = [jax.tree.leaves(one) for one in everyone]
-    pieces = [taken(*(one[k] for one in every)) for k in range(len(leaves))]
-    waves = [
-        Wave(*on_devices(trainer.mesh, jax.tree.unflatten(shape, [piece[k] for piece in pieces])))
-        for k in range(len(pieces[0]))
+    batches = [
+        (batch.agents, batch.keys, batch.state, batch.best)
+        for training in trainings
+        for batch in training.group_batches
     ]
-    n = len(waves) // count
+    structure = jax.tree.structure(batches[0])
+    leaves = [regrouped(*parts) for parts in zip(*map(jax.tree.leaves, batches), strict=True)]
+    moved = [
+        GroupBatch(*put_on_mesh(trainer.mesh, jax.tree.unflatten(structure, parts)))
+        for parts in zip(*leaves, strict=True)
+    ]
+    per_shard = len(moved) // shards
     made = []
-    for k, block in enumerate(blocks):
-        training = Training(trainer, waves[k * n : (k + 1) * n], done=trainings[0].done)
-        for name in ("slots", "episodes", "scores"):
+    for k, own in enumerate(places):
+        training = Training(trainer, moved[k * per_shard : (k + 1) * per_shard], trainings[0].chunks_done)
+        for name in ("episode_slots", "episodes", "scores"):
             if getattr(trainings[0], name):
                 curves = np.concatenate([np.stack(getattr(old, name), 1) for old in trainings])
-                setattr(training, name, list(curves[block].T))
+                setattr(training, name, list(curves[own].T))
         made.append(training)
     return made
