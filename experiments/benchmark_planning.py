@@ -24,7 +24,7 @@ from uavmec_jax.env.params import Params
 from uavmec_jax.planning.beam import horizon
 from uavmec_jax.planning.parallel import beam_episodes, bound_scenarios, rollout_planner_episodes
 from uavmec_jax.planning.rollout_planner import SAMPLES
-from uavmec_jax.scenarios.seeds import held_out_draws, town
+from uavmec_jax.scenarios.seeds import held_out_draws, layout_for_seed
 
 CELLS = [(12, 4), (10, 10), (8, 8), (4, 4)]
 
@@ -51,7 +51,7 @@ def main() -> None:
 def benchmark(powered: int, connected: int, count: int, widths: list[int]) -> list[dict[str, Any]]:
     """One row per planner: mean lifetime, seconds of the first call (with compilation) and of the second."""
     params = jax.tree.map(lambda leaf: jnp.full(count, leaf), Params())
-    layouts = jax.vmap(lambda seed: town(seed, Params(), powered, connected))(jnp.arange(count))
+    layouts = jax.vmap(lambda seed: layout_for_seed(seed, Params(), powered, connected))(jnp.arange(count))
     keys = jnp.concatenate([held_out_draws(seed, powered, connected, 1) for seed in range(count)])
     scenarios = (params, layouts, keys)
     slots = horizon(params, layouts)

@@ -58,9 +58,9 @@ def sb3_worker(seeds: list[int], steps: int) -> None:
 def layout() -> Any:
     """The one layout: what studies call seed 0 with 8 powered and 8 connected devices."""
     from uavmec_jax.env.params import Params
-    from uavmec_jax.scenarios.seeds import town
+    from uavmec_jax.scenarios.seeds import layout_for_seed
 
-    return town(0, Params(), 8, 8)
+    return layout_for_seed(0, Params(), 8, 8)
 
 
 def draws() -> Any:

@@ -35,7 +35,7 @@ def told():
 
 
 def test_json_says_what_was_asked(told):
-    names = um.load_scenario_file(HARBOUR).names
+    names = um.scenarios.load_scenario_file(HARBOUR).names
     assert told["next"]["name"] in names
     assert told["ranking"][0]["name"] == told["next"]["name"]
     assert sorted(one["name"] for one in told["ranking"]) == sorted(names)
@@ -51,7 +51,7 @@ def test_json_says_what_was_asked(told):
 @pytest.mark.slow
 def test_one_visit_after_the_other(tmp_path, told):
     """The state that it prints can be given back; the next one is advised on likewise."""
-    named_scenario = um.load_scenario_file(HARBOUR)
+    named_scenario = um.scenarios.load_scenario_file(HARBOUR)
     state = um.initial_state(named_scenario.params, named_scenario.layout)
     volumes = jnp.full(6, 3e6)
     after, outcome = um.transition(
@@ -132,10 +132,10 @@ def test_the_shipped_policy_is_a_policy_like_any_other(generalist, n):
 def test_it_decides_from_raw_observations(generalist):
     params, layout = um.Params(), um.sample_layout(jax.random.key(1), um.Params(), 8, 8)
     state = um.initial_state(params, layout)
-    seen = um.observe_devices(params, layout, state)
+    seen = um.planning.observe_devices(params, layout, state)
     row = np.concatenate([seen.features, np.ones((12, 1), np.float32)], axis=1).reshape(-1)
     assert generalist.act(row) == int(generalist(params, layout, state))
-    with pytest.raises(um.PolicyError, match="it should be"):
+    with pytest.raises(um.UserError, match="it should be"):
         generalist.act(row[:-1])
 
 
@@ -148,7 +148,10 @@ def test_it_is_far_above_oldest_first(generalist):
     def lives(key):
         layout = um.sample_layout(key, params, 8, 8)
         keys = jax.random.split(key, 4)
-        return [um.rollouts(one, params, layout, keys).length for one in (generalist, um.HEURISTICS["oldest-first"])]
+        return [
+            um.rollouts(one, params, layout, keys).length
+            for one in (generalist, um.planning.HEURISTICS["oldest-first"])
+        ]
 
     own, oldest = jax.vmap(lives)(jax.random.split(jax.random.key(7), 24))
     assert own.mean() > 1.12 * oldest.mean()
@@ -158,7 +161,7 @@ def test_it_is_far_above_oldest_first(generalist):
 def test_a_first_failure_is_foretold(generalist):
     """The forecast of one town holds on other futures of it."""
     params, layout = um.Params(), um.sample_layout(jax.random.key(11), um.Params(), 4, 8)
-    advice = um.advise(generalist, params, layout, samples=64)
+    advice = um.planning.advise(generalist, params, layout, samples=64)
     state, keys = um.initial_state(params, layout), jax.random.split(jax.random.key(5), 64)
     played = jax.jit(jax.vmap(lambda key: rollout_from(generalist, params, layout, state, key)))(keys)
     share = np.asarray(played.first_failure).mean(axis=0)
@@ -172,7 +175,7 @@ def test_an_altered_file_is_refused(tmp_path, generalist):
     content = bytearray((_SHIPPED / "generalist.npz").read_bytes())
     content[len(content) // 2] ^= 4
     (tmp_path / "mine.npz").write_bytes(content)
-    with pytest.raises(um.PolicyError, match=r"mine\.npz"):
+    with pytest.raises(um.UserError, match=r"mine\.npz"):
         load_policy(tmp_path / "mine.npz")
 
 
@@ -182,5 +185,5 @@ def test_a_file_with_other_features_is_refused(tmp_path, monkeypatch, generalist
     generalist.save(tmp_path / "mine.npz")
     assert int(load_policy(tmp_path / "mine.npz").collection.n_devices) == 16
     monkeypatch.setattr(collection, "FEATURES", collection.FEATURES[:-1])
-    with pytest.raises(um.PolicyError, match="see other features of a device than those of this version"):
+    with pytest.raises(um.UserError, match="see other features of a device than those of this version"):
         load_policy(tmp_path / "mine.npz")

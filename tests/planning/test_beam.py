@@ -11,7 +11,7 @@ from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import rollout, tour_policy, volume_table
 from uavmec_jax.planning import demand
 from uavmec_jax.planning.beam import _dominated, beam_search
-from uavmec_jax.scenarios.seeds import town
+from uavmec_jax.scenarios.seeds import layout_for_seed
 
 search = jax.jit(beam_search, static_argnums=3)
 PARAMS = traced(Params())
@@ -19,14 +19,14 @@ PARAMS = traced(Params())
 
 def pair_town():
     """Nobody has power or communication; devices 0 and 1 can be served together."""
-    layout = town(0, PARAMS, 0, 0)
+    layout = layout_for_seed(0, PARAMS, 0, 0)
     position = jnp.stack([200.0 * (jnp.arange(12) % 4), 300.0 * (jnp.arange(12) // 4)], axis=1)
     return layout.replace(position=position.at[1].set(position[0] + 40.0), capacity=jnp.full(12, 79_000.0))
 
 
 @pytest.mark.parametrize(("powered", "connected", "seed"), [(8, 8, 3), (4, 4, 14)])
 def test_the_tour_lives_as_long_as_it_says(powered, connected, seed):
-    layout, key = town(seed, PARAMS, powered, connected), jax.random.key(seed)
+    layout, key = layout_for_seed(seed, PARAMS, powered, connected), jax.random.key(seed)
     tour = search(PARAMS, layout, volume_table(PARAMS, 12, key, SLOTS), 64)
     episode = rollout(tour_policy(tour.actions), PARAMS, layout, key)
     assert episode.length == tour.lifetime <= tour.aim
@@ -42,7 +42,7 @@ def test_a_shared_hover_point_lives_longer_than_eleven():
 
 
 def test_aim_is_lowered_from_a_bound_that_is_known():
-    layout = town(3, PARAMS, 8, 8)
+    layout = layout_for_seed(3, PARAMS, 8, 8)
     volumes = volume_table(PARAMS, 12, jax.random.key(0), SLOTS)
     free, held = (jax.jit(lambda most: beam_search(PARAMS, layout, volumes, 16, most))(most) for most in (99, 15))
     assert held.aim == 15
@@ -50,7 +50,7 @@ def test_aim_is_lowered_from_a_bound_that_is_known():
 
 
 def test_dominance():
-    layout = town(0, PARAMS, 0, 0)
+    layout = layout_for_seed(0, PARAMS, 0, 0)
     start = initial_state(PARAMS, layout)
     states = jax.tree.map(lambda leaf: jnp.stack([leaf] * 5), start)
     states = states.replace(
@@ -69,7 +69,7 @@ def test_dominance():
 def test_shares_never_charge_a_hover_point_more_than_one_visit():
     for seed in range(8):
         params = Params(region_m=(150.0, 150.0))
-        layout = town(seed, params, 6, 6)
+        layout = layout_for_seed(seed, params, 6, 6)
         covers = demand.coverage(params, layout)
         charged = demand.visit_shares(layout, covers)
         assert (covers @ charged).max() <= 1 + 1e-6
@@ -78,7 +78,7 @@ def test_shares_never_charge_a_hover_point_more_than_one_visit():
 
 
 def test_battery_visits_skip_the_largest_savings_first():
-    layout = town(0, PARAMS, 11, 12)
+    layout = layout_for_seed(0, PARAMS, 11, 12)
     volumes = volume_table(PARAMS, 12, jax.random.key(0), SLOTS)
     costs = jax.jit(demand.slot_costs)(PARAMS, layout, volumes)
     device = int(np.flatnonzero(~layout.has_power)[0])
@@ -96,7 +96,7 @@ def test_battery_visits_skip_the_largest_savings_first():
 
 
 def test_mean_slot_is_the_mean_of_many():
-    layout = town(1, PARAMS, 0, 0)
+    layout = layout_for_seed(1, PARAMS, 0, 0)
     many = jax.jit(demand.slot_costs)(PARAMS, layout, volume_table(PARAMS, 12, jax.random.key(0), 20_000))
     mean = jax.jit(demand.mean_slot)(PARAMS, layout)
     np.testing.assert_allclose(mean.work, many.work.mean(axis=0), rtol=0.01)

@@ -19,7 +19,7 @@ from uavmec_jax.planning.flight import Rounds
 from uavmec_jax.planning.heuristics import HEURISTICS
 from uavmec_jax.planning.parallel import beam_episodes, bound_scenarios, heuristic_episodes, rollout_planner_episodes
 from uavmec_jax.planning.rollout_planner import rollout_planner
-from uavmec_jax.scenarios.seeds import town
+from uavmec_jax.scenarios.seeds import layout_for_seed
 
 search = jax.jit(beam_search, static_argnums=3)
 
@@ -50,7 +50,7 @@ def test_nothing_passes_the_bound_on_small_instances(block):
 def test_nobody_passes_the_bound_at_the_papers_settings(powered, connected):
     params = traced(Params())
     for seed in range(2):
-        layout, key = town(seed, params, powered, connected), jax.random.key(seed)
+        layout, key = layout_for_seed(seed, params, powered, connected), jax.random.key(seed)
         volumes = volume_table(params, 12, key, SLOTS)
         bound = upper_bound(params, layout, volumes)
         lives = {name: int(play(name)(params, layout, key).length) for name in ("earliest-deadline", "oldest-first")}
@@ -68,7 +68,9 @@ def test_nobody_passes_the_bound_in_many_towns(side):
     count = 32
     params = jax.tree.map(lambda leaf: jnp.full(count, leaf), Params(region_m=(side, side)))
     counts = np.random.default_rng(int(side)).integers(0, 13, (2, count))
-    layouts = jax.vmap(lambda seed, own, p, c: town(seed, own, p, c))(jnp.arange(count), params, *jnp.asarray(counts))
+    layouts = jax.vmap(lambda seed, own, p, c: layout_for_seed(seed, own, p, c))(
+        jnp.arange(count), params, *jnp.asarray(counts)
+    )
     keys = jax.random.split(jax.random.key(int(side)), count)
     slots = horizon(params, layouts)
     lives = {name: heuristic_episodes((name,), params, layouts, keys[:, None]).length[0, :, 0] for name in HEURISTICS}
@@ -81,11 +83,11 @@ def test_nobody_passes_the_bound_in_many_towns(side):
 
 def test_what_is_known_in_closed_form():
     params = traced(Params())
-    everything = town(0, params, 12, 12)
+    everything = layout_for_seed(0, params, 12, 12)
     volumes = volume_table(params, 12, jax.random.key(0), SLOTS)
     assert upper_bound(params, everything, volumes) == int(search(params, everything, volumes, 64).lifetime) >= 33
     far = jnp.stack([200.0 * jnp.arange(12) % 800, 250.0 * (jnp.arange(12) // 4)], axis=1)
-    nothing = town(0, params, 0, 0).replace(position=far)
+    nothing = layout_for_seed(0, params, 0, 0).replace(position=far)
     assert upper_bound(params, nothing, volumes) == 11
     assert int(search(params, nothing, volumes, 64).lifetime) == 11
 
@@ -93,7 +95,7 @@ def test_what_is_known_in_closed_form():
 def test_volumes_that_end_before_a_life_may_are_refused():
     params = traced(Params())
     with pytest.raises(ValueError, match="volumes are given for 16 slots, and lives may be longer"):
-        upper_bound(params, town(3, params, 8, 8), volume_table(params, 12, jax.random.key(0), 16))
+        upper_bound(params, layout_for_seed(3, params, 8, 8), volume_table(params, 12, jax.random.key(0), 16))
 
 
 def test_horizon_is_never_passed():

@@ -23,11 +23,11 @@ from uavmec_jax.planning.heuristics import (
 )
 from uavmec_jax.planning.rollout_planner import rollout_planner
 from uavmec_jax.planning.shortest_tour import shortest_tour, two_opt
-from uavmec_jax.scenarios.seeds import town
+from uavmec_jax.scenarios.seeds import layout_for_seed
 
 PARAMS, LAYOUT = Params(n_devices=3), three_devices()
 START = initial_state(PARAMS, LAYOUT)
-START_12 = initial_state(Params(), town(3, Params(), 8, 8))
+START_12 = initial_state(Params(), layout_for_seed(3, Params(), 8, 8))
 
 
 def test_oldest_first_takes_the_oldest_and_the_lowest_number_on_ties():
@@ -78,7 +78,7 @@ def test_shortest_life_holds_batteries_against_ages():
 
 
 def test_earliest_deadline_fetches_data_just_in_time_and_serves_batteries_meanwhile():
-    layout = town(3, Params(), 8, 8)
+    layout = layout_for_seed(3, Params(), 8, 8)
     played = jax.jit(lambda key: trace(earliest_deadline, Params(), layout, key, 18))(jax.random.key(0))
     visits = np.asarray(played.action)[np.asarray(played.played)]
     unconnected = np.flatnonzero(~np.asarray(layout.has_comms))
@@ -90,7 +90,7 @@ def test_earliest_deadline_fetches_data_just_in_time_and_serves_batteries_meanwh
 
 
 def test_earliest_deadline_rests_where_nothing_is_asked_for():
-    layout = town(0, Params(), 12, 12)
+    layout = layout_for_seed(0, Params(), 12, 12)
     state = initial_state(Params(), layout).replace(uav_position=layout.position[7])
     assert jax.jit(earliest_deadline)(Params(), layout, state) == 7
 
@@ -104,7 +104,7 @@ def test_devices_that_share_a_hover_point_share_a_visit():
 
 
 def test_shortest_tour_is_a_tour_through_the_needy():
-    layout = town(5, Params(), 6, 6)
+    layout = layout_for_seed(5, Params(), 6, 6)
     needy = np.flatnonzero(~np.asarray(layout.has_power & layout.has_comms))
     policy = jax.jit(shortest_tour)
     order = [int(policy(Params(), layout, START_12.replace(slot=jnp.int32(slot)))) for slot in range(len(needy))]
@@ -126,7 +126,7 @@ def test_two_opt_uncrosses():
 
 
 def test_rollout_planner_knows_no_volumes_and_needs_a_key():
-    layout = town(3, Params(), 8, 8)
+    layout = layout_for_seed(3, Params(), 8, 8)
     policy = rollout_planner(samples=2)
     with pytest.raises(ValueError, match="needs a key"):
         policy(Params(), layout, START_12)
@@ -137,7 +137,7 @@ def test_rollout_planner_knows_no_volumes_and_needs_a_key():
 
 @pytest.mark.slow
 def test_rollout_planner_improves_on_its_base():
-    layouts = [town(seed, Params(), 8, 8) for seed in range(6)]
+    layouts = [layout_for_seed(seed, Params(), 8, 8) for seed in range(6)]
     towns = jax.tree.map(lambda *leaves: jnp.stack(leaves), *layouts)
     keys = jax.random.split(jax.random.key(0), 6)
 

@@ -21,7 +21,7 @@ def test_a_reward_function_is_given_again(tmp_path):
     run_study(STUDY, tmp_path / "run", reward=survival, command="x", shard_size=2, on_progress=stop_after(3))
     for attempt in (resume_run, work_on):
         with pytest.raises(
-            StudyError, match=r"was started with the reward function .*survival; give it to um.resume_run"
+            StudyError, match=r"was started with the reward function .*survival; give it to um.runs.resume_run"
         ):
             attempt(tmp_path / "run")
     again = resume_run(tmp_path / "run", reward=survival)

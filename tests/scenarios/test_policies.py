@@ -19,7 +19,7 @@ from uavmec_jax.planning.heuristics import HEURISTICS
 from uavmec_jax.runs.run import run_study
 from uavmec_jax.scenarios.policies import TrainedPolicy, load_policy
 from uavmec_jax.scenarios.policy_files import PolicyCollection, write_policies
-from uavmec_jax.scenarios.seeds import held_out_draws, town
+from uavmec_jax.scenarios.seeds import held_out_draws, layout_for_seed
 from uavmec_jax.studies.schema import DQNSettings, PPOSettings
 from uavmec_jax.studies.study import parse_study
 
@@ -65,7 +65,7 @@ def test_an_agent_of_a_run_lives_as_long_as_the_table_says(tmp_path):
     results = run_study(parse_study(TINY, "tiny"), tmp_path / "run")
     policy = load_policy(tmp_path / "run", powered=4, connected=12, seed=1)
     assert policy.trained_on == {"seed": 1, "powered": 4, "connected": 12}
-    layout = town(1, um.Params(), 4, 12)
+    layout = layout_for_seed(1, um.Params(), 4, 12)
     played = jax.jit(lambda keys: um.rollouts(policy, um.Params(), layout, keys))(held_out_draws(1, 4, 12, 5))
     row = results.agents.query("powered == 4 and connected == 12 and seed == 1")
     assert_allclose(played.length.mean(), row["best_lifetime"].item(), rtol=1e-6)
@@ -74,7 +74,7 @@ def test_an_agent_of_a_run_lives_as_long_as_the_table_says(tmp_path):
 @pytest.mark.parametrize("kind", ["dqn", "ppo"])
 def test_batched_states_and_numpy_observations(run, ppo_policy, kind):
     policy = ppo_policy if kind == "ppo" else load_policy(run, "last", powered=12, connected=4, seed=0)
-    layout = town(0, um.Params(), 12, 4)
+    layout = layout_for_seed(0, um.Params(), 12, 4)
     state = um.initial_state(um.Params(), layout)
     states = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (3, 2, *leaf.shape)), state)
     states = states.replace(age=jax.random.randint(jax.random.key(0), (3, 2, 12), 0, 10))
@@ -137,7 +137,7 @@ def test_observation_that_is_none_and_another_number_of_devices(run):
     with pytest.raises(PolicyError, match="is not an array of numbers"):
         policy.act(["a", "b"])
     params = um.Params(n_devices=5)
-    layout = town(0, params, 2, 2)
+    layout = layout_for_seed(0, params, 2, 2)
     with pytest.raises(PolicyError, match="was trained for 12 devices; the layout has 5"):
         policy(params, layout, um.initial_state(params, layout))
 

@@ -12,7 +12,7 @@ from uavmec_jax.env.params import Params
 from uavmec_jax.errors import ScenarioError
 from uavmec_jax.scenarios.named_scenario import name_scenario
 from uavmec_jax.scenarios.scenario_files import load_scenario_file, scenario_text
-from uavmec_jax.scenarios.seeds import town
+from uavmec_jax.scenarios.seeds import layout_for_seed
 from uavmec_jax.search.confirm import OWN
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
@@ -27,7 +27,7 @@ capacity_j = 5e4
 """
 
 
-def written(tmp_path, text, name="town.toml"):
+def written(tmp_path, text, name="layout_for_seed.toml"):
     path = tmp_path / name
     path.write_text(text)
     return path
@@ -72,8 +72,8 @@ def test_csv_reads_back_to_the_same(tmp_path):
 
 def test_a_random_town_reads_back_to_the_same(tmp_path):
     params = Params(region_m=(500.0, 300.0))
-    layout = town(4, params, 5, 7)
-    again = load_scenario_file(written(tmp_path, scenario_text(name_scenario(layout, params, "town"))))
+    layout = layout_for_seed(4, params, 5, 7)
+    again = load_scenario_file(written(tmp_path, scenario_text(name_scenario(layout, params, "layout_for_seed"))))
     jax.tree.map(assert_array_equal, again.layout, layout)
     assert again.params == params
 
@@ -120,7 +120,7 @@ def test_bad_inventory_is_one_clear_line(tmp_path, text, message):
     with pytest.raises(ScenarioError) as error:
         load_scenario_file(written(tmp_path, text))
     assert message in str(error.value)
-    assert str(error.value).startswith(str(tmp_path / "town.toml"))
+    assert str(error.value).startswith(str(tmp_path / "layout_for_seed.toml"))
     assert "\n" not in str(error.value)
 
 
@@ -138,7 +138,7 @@ def test_bad_inventory_is_one_clear_line(tmp_path, text, message):
 )
 def test_bad_csv_is_one_clear_line(tmp_path, text, message):
     with pytest.raises(ScenarioError) as error:
-        load_scenario_file(written(tmp_path, text, "town.csv"))
+        load_scenario_file(written(tmp_path, text, "layout_for_seed.csv"))
     assert message in str(error.value)
 
 

@@ -15,7 +15,7 @@ from uavmec_jax.studies.population import (
     make_agents,
     make_algorithm,
     n_agents,
-    parts,
+    split_by_algorithm,
     validation_keys,
 )
 from uavmec_jax.studies.study import load_study, parse_study, study_toml
@@ -229,7 +229,7 @@ def test_algorithms_are_cut_into_parts_of_one_program_each():
     study = parse_study(CELLS, "x", {"axes.algorithm": ["a2c", "dqn"], "axes.gamma": [0.9, 0.98], "a2c.vf_coef": 0.3})
     assert n_agents(study) == len(make_agent_ids(study)) == 16
     assert [one["algorithm"] for one in make_agent_ids(study)] == ["a2c"] * 8 + ["dqn"] * 8
-    a2c, dqn = parts(study)
+    a2c, dqn = split_by_algorithm(study)
     assert (make_algorithm(a2c).name, make_algorithm(dqn).name) == ("a2c", "dqn")
     agents, others = make_agents(a2c), make_agents(dqn)
     assert_array_equal(agents.hyper.gamma, np.tile(np.float32([0.9, 0.98]), 4))

@@ -23,7 +23,7 @@ changes = {"axes.seeds": 2, "axes.powered": [12, 8], "axes.connected": [8, 4], "
 study = um.load_study("table5", changes)
 blocks = Partition(count=1, size=8, groups=4, bytes=0)
 assert blocks.devices == int(sys.argv[1])
-validation = um.Validation(every=400, draws=16)
+validation = um.training.Validation(every=400, draws=16)
 (trained,) = population.train(
     make_algorithm(study), make_agents(study), validation_keys(study), validation=validation, blocks=blocks
 )

@@ -19,7 +19,7 @@ from uavmec_jax.env.scenario import make_scenario
 from uavmec_jax.planning.heuristics import HEURISTICS
 from uavmec_jax.training import population
 from uavmec_jax.training.partition import Partition, PopulationTooLargeError, partition_population
-from uavmec_jax.training.programs import Best, _look
+from uavmec_jax.training.programs import Best, _validate
 from uavmec_jax.training.training import Validation
 
 GIB = 2**30
@@ -152,8 +152,8 @@ def test_the_best_look_is_the_longest_life_or_what_pays_most(paid):
     agent = replace(make_agent(), scenario=scenario)
     best = Best(jnp.int32(7), jnp.float32(-jnp.inf), jnp.int32(0))
     keys = jax.random.split(jax.random.key(0), 2)
-    first, best = _look(stays, agent, keys, jnp.int32(0), best, 10)
-    second, best = _look(stays, agent, keys, jnp.int32(1), best, 20)
+    first, best = _validate(stays, agent, keys, jnp.int32(0), best, 10)
+    second, best = _validate(stays, agent, keys, jnp.int32(1), best, 20)
     earned = 33 * 34 / 2 + 33  # the slot that the UAV's battery cannot pay for is the 34th decision, with U = 33
     assert first == (earned if paid else 33)
     assert second == (earned + 2 * 34 if paid else 33)

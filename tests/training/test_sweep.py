@@ -25,7 +25,7 @@ def test_a_sweep_of_ones_own(scenarios):
         steps=2000,
         hyper={"learning_rate": rates, "gamma": 0.95},
         settings={"hidden": (16,), "n_envs": 2},
-        validation=um.Validation(every=500, draws=4),
+        validation=um.training.Validation(every=500, draws=4),
     )
     table = trained.table()
     assert table["learning_rate"].tolist() == rates.tolist()
@@ -54,5 +54,5 @@ def test_a_sweep_of_ones_own(scenarios):
 )
 def test_what_cannot_be_trained_is_said(scenarios, changes, line):
     wanted = {"algorithm": "dqn", "key": jax.random.key(0), "steps": 100} | changes
-    with pytest.raises(um.StudyError, match=line):
+    with pytest.raises(um.UserError, match=line):
         um.train(wanted.pop("algorithm"), scenarios, **wanted)

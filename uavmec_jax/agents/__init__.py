@@ -1,1 +1,5 @@
-"""Learners: networks, replay, one file per algorithm, and the population that trains many agents at once."""
+"""Learning algorithms of one agent: networks, replay, optimisers, and one file per algorithm."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -27,7 +27,7 @@ class UavMecEnv:
 
     Attributes:
         observation_fn: ``(params, layout, state) -> observation``, an array or a pytree; by default the paper's.
-            :func:`uavmec_jax.observe_devices` is the full one.
+            :func:`um.planning.observe_devices` is the full one.
     """
 
     observation_fn: Callable[[Params, Layout, State], Any] = observe_as_paper

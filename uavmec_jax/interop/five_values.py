@@ -38,7 +38,7 @@ class FiveValueEnv:
 
     @property
     def default_params(self) -> FiveValueParams:
-        """The scenario of :func:`uavmec_jax.make_scenario`."""
+        """The scenario of :func:`um.make_scenario`."""
         return FiveValueParams(scenario=make_scenario())
 
     def reset(self, key: PRNGKeyArray, params: FiveValueParams | None = None) -> tuple[Array, State]:

@@ -35,7 +35,7 @@ class UavMecGymEnv(gymnasium.Env):
         """Bind a scenario.
 
         Args:
-            scenario: by default that of :func:`uavmec_jax.make_scenario`.
+            scenario: by default that of :func:`um.make_scenario`.
             render_mode: ``None`` or ``"rgb_array"``.
 
         Raises:

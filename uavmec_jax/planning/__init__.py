@@ -1,1 +1,5 @@
-"""Policies that learn nothing: baselines, planners, bounds."""
+"""Policies that learn nothing, and certificates: heuristics, planners, upper bounds, forecasts, the full observation."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

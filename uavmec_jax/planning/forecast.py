@@ -61,7 +61,7 @@ class Forecast:
         return max(1.0 - float(self.first_failure.sum()), 0.0)
 
 
-def forecast(
+def make_forecast(
     policy: Policy,
     params: Params,
     layout: Layout,

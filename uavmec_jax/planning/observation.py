@@ -74,7 +74,7 @@ class Observation:
 
     Attributes:
         features: ``[n, F]`` f32, see :data:`FEATURES`; zero where there is no device.
-        mask: ``[n]`` bool, which entries are devices (layouts may be padded, see :func:`uavmec_jax.pad_layout`).
+        mask: ``[n]`` bool, which entries are devices (layouts may be padded, see :func:`um.env.pad_layout`).
     """
 
     features: Any

@@ -131,7 +131,11 @@ class RunFolder:
         """
         wanted = self.facts["label"].get("reward_function")
         if (wanted is None) != (given is None):
-            say = f"was started with the reward function {wanted}; give it to um.resume_run" if wanted else "had none"
+            say = (
+                f"was started with the reward function {wanted}; give it to um.runs.resume_run"
+                if wanted
+                else "had none"
+            )
             raise StudyError(f"{self.path}: reward: the run {say}")
 
     @property

@@ -71,7 +71,7 @@ def work_on(
 
     Raises:
         StudyError: the directory holds no run, its plan is damaged, it was planned by other code, or has a reward
-            function, which only :func:`um.resume_run` can be given.
+            function, which only :func:`um.runs.resume_run` can be given.
         Interrupted: a signal came; what this worker had is kept.
     """
     path = Path(directory)

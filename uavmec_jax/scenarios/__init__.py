@@ -1,1 +1,5 @@
 """What a user hands in: scenarios, states, places and policies, with the schemas of their files."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,9 @@
+from .a2c import A2CHyper as A2CHyper
+from .a2c import A2CSpec as A2CSpec
+from .algorithm import Agent as Agent
+from .algorithm import Algorithm as Algorithm
+from .dqn import DQNHyper as DQNHyper
+from .dqn import DQNSpec as DQNSpec
+from .ppo import PPOHyper as PPOHyper
+from .ppo import PPOSpec as PPOSpec
+from .registry import ALGORITHMS as ALGORITHMS

@@ -1,0 +1,14 @@
+from .advice import advise_on as advise_on
+from .load import load_scenario as load_scenario
+from .named_scenario import NamedScenario as NamedScenario
+from .named_scenario import make_named_scenario as make_named_scenario
+from .named_scenario import name_scenario as name_scenario
+from .places import on_place as on_place
+from .policies import TrainedPolicy as TrainedPolicy
+from .policies import load_policy as load_policy
+from .scenario_files import load_scenario_file as load_scenario_file
+from .scenario_files import scenario_text as scenario_text
+from .seeds import held_out_draws as held_out_draws
+from .seeds import layout_for_seed as layout_for_seed
+from .state_files import load_state as load_state
+from .state_files import state_data as state_data

@@ -1,0 +1,10 @@
+from .compare import Side as Side
+from .compare import differences as differences
+from .compare import overall as overall
+from .compare import pair as pair
+from .policy_evaluation import evaluate_policy as evaluate_policy
+from .results import Results as Results
+from .results_files import load_weights as load_weights
+from .schema import Study as Study
+from .study import load_study as load_study
+from .study import study_toml as study_toml
