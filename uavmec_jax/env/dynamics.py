@@ -12,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
+from uavmec_jax.env.types import Scalar
 
 
 class Cause(enum.IntEnum):
@@ -40,12 +41,12 @@ class State:
         elapsed: s, length of the slots completed.
     """
 
-    battery: Any
-    age: Any
-    uav_position: Any
-    uav_energy: Any
-    slot: Any
-    elapsed: Any = 0.0
+    battery: Float[Array, "*batch n"]
+    age: Int[Array, "*batch n"]
+    uav_position: Float[Array, "*batch 2"]
+    uav_energy: Float[Array, "*batch"]
+    slot: Int[Array, "*batch"]
+    elapsed: Scalar = 0.0
 
 
 @struct.dataclass
@@ -61,11 +62,11 @@ class Outcome:
             all of it on the battery that runs out earliest inside the slot; expired data share equally.
     """
 
-    cause: Any
-    failed: Any
-    served: Any
-    duration: Any
-    first_failure: Any
+    cause: Int[Array, "*batch"]
+    failed: Bool[Array, "*batch n"]
+    served: Bool[Array, "*batch n"]
+    duration: Float[Array, "*batch"]
+    first_failure: Float[Array, "*batch n"]
 
 
 def initial_state(params: Params, layout: Layout) -> State:

@@ -14,6 +14,7 @@ from uavmec_jax.env.layout import Layout, Traffic, make_layout, mask_absent
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rewards import Reward
 from uavmec_jax.env.scenario import Scenario
+from uavmec_jax.env.types import Range, Scalar
 
 _SCENARIO_STREAM = 2**32 - 2
 """``fold_in`` number of a draw's scenario; the slots' volumes and the policy use their own numbers."""
@@ -47,19 +48,19 @@ class ScenarioDistribution:
 
     params: Params
     reward: Reward
-    typical: Any = struct.field(default=0.5, metadata={"ge": 0, "le": 1})
-    typical_devices: Any = struct.field(default=12, metadata={"ge": 2, "le": 64})
-    typical_least: Any = struct.field(default=4, metadata={"ge": 0, "le": 64})
-    devices: Any = (4, 16)
-    powered: Any = (0.0, 1.0)
-    connected: Any = (0.0, 1.0)
-    region_m: Any = (300.0, 2500.0)
-    battery_factor: Any = (0.5, 2.0)
-    hardware_factor: Any = (0.7, 1.4)
-    uav_factor: Any = (0.7, 1.4)
-    traffic: Any = struct.field(default=0.5, metadata={"ge": 0, "le": 1})
-    traffic_price: Any = (0.0, 20.0)
-    traffic_weights: Any = (0.0,)
+    typical: Scalar = struct.field(default=0.5, metadata={"ge": 0, "le": 1})
+    typical_devices: Scalar = struct.field(default=12, metadata={"ge": 2, "le": 64})
+    typical_least: Scalar = struct.field(default=4, metadata={"ge": 0, "le": 64})
+    devices: Range = (4, 16)
+    powered: Range = (0.0, 1.0)
+    connected: Range = (0.0, 1.0)
+    region_m: Range = (300.0, 2500.0)
+    battery_factor: Range = (0.5, 2.0)
+    hardware_factor: Range = (0.7, 1.4)
+    uav_factor: Range = (0.7, 1.4)
+    traffic: Scalar = struct.field(default=0.5, metadata={"ge": 0, "le": 1})
+    traffic_price: Range = (0.0, 20.0)
+    traffic_weights: tuple[float, ...] | Float[Array, "*batch m"] = (0.0,)
 
 
 def sample_scenario(distribution: ScenarioDistribution, key: PRNGKeyArray) -> Scenario:

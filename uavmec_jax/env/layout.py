@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from uavmec_jax.env import hardware as tables
 from uavmec_jax.env.params import Params
+from uavmec_jax.env.types import Scalar
 
 
 @struct.dataclass
@@ -24,9 +25,9 @@ class Traffic:
             less for others in proportion; what a policy that knows the full observation aims at.
     """
 
-    weight: Any
-    window_s: Any = math.inf
-    price: Any = 0.0
+    weight: Float[Array, "*batch W n"]
+    window_s: Scalar = math.inf
+    price: Scalar = 0.0
 
     def at(self, seconds: Any) -> Any:
         """Weights ``[n]`` at a time in seconds since the first slot began."""
@@ -54,17 +55,17 @@ class Layout:
         present: ``[n]`` bool, which entries are devices, the others fill up (:func:`pad_layout`); ``None``: all are.
     """
 
-    position: Any
-    device_type: Any
-    task: Any
-    capacity: Any
-    has_power: Any
-    has_comms: Any
-    standby_power: Any
-    active_power: Any
-    processing_rate: Any
+    position: Float[Array, "*batch n 2"]
+    device_type: Int[Array, "*batch n"]
+    task: Int[Array, "*batch n"]
+    capacity: Float[Array, "*batch n"]
+    has_power: Bool[Array, "*batch n"]
+    has_comms: Bool[Array, "*batch n"]
+    standby_power: Float[Array, "*batch n"]
+    active_power: Float[Array, "*batch n"]
+    processing_rate: Float[Array, "*batch n"]
     traffic: Traffic | None = None
-    present: Any = None
+    present: Bool[Array, "*batch n"] | None = None
 
     def failure_price(self, seconds: Any) -> Any:
         """Slots of life ``[n]`` that the first failure of each device is priced at, at a time as in :meth:`Traffic.at`."""

@@ -6,11 +6,10 @@ from typing import Any
 import jax.numpy as jnp
 from flax import struct
 
+from uavmec_jax.env.types import Range, Scalar
+
 MAX_DEVICES = 64
 """Most devices of a scenario."""
-
-Scalar = Any
-"""A Python number, or an array: ``[]`` for one scenario, ``[B]`` for a batch under ``vmap``."""
 
 
 @struct.dataclass
@@ -35,12 +34,12 @@ class Params:
     reference_gain_db_at_1m: Scalar = struct.field(default=-50.0, metadata={"ge": -300, "le": 300})
     path_loss_exponent: Scalar = struct.field(default=4.0, metadata={"gt": 0})
     transmit_power_w: Scalar = struct.field(default=0.1, metadata={"gt": 0})
-    device_battery_range_j: tuple[Scalar, Scalar] = (50_000.0, 80_000.0)
-    task_volume_range_bytes: tuple[Scalar, Scalar] = (2e6, 4e6)
+    device_battery_range_j: Range = (50_000.0, 80_000.0)
+    task_volume_range_bytes: Range = (2e6, 4e6)
     data_age_limit_slots: Scalar = struct.field(default=10, metadata={"ge": 0, "le": 250})
     slot_cap_s: Scalar = struct.field(default=600.0, metadata={"gt": 0})
     """Longest local processing time; what does not fit is dropped."""
-    region_m: tuple[Scalar, Scalar] = (800.0, 800.0)
+    region_m: Range = (800.0, 800.0)
     result_message_bytes: Scalar = 1000.0
 
     uplink_rate_bit_s: Scalar = struct.field(default=math.inf, metadata={"gt": 0})

@@ -12,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from uavmec_jax.env.dynamics import Outcome, State
 from uavmec_jax.env.layout import Layout
+from uavmec_jax.env.types import Scalar
 
 TERMS: tuple[str, ...] = ("A", "U", "M", "O", "log A", "log U", "log M", "log O")
 """The terms a reward weighs, in the order of a weight vector.
@@ -78,12 +79,12 @@ class Reward:
         per_slot: added for every slot that counts; with nothing else, the sum of the rewards is the lifetime.
     """
 
-    weights: Any
-    log1p: Any = False
+    weights: Float[Array, "*batch 8"]
+    log1p: Scalar = False
     function: Callable[[Mapping[str, Any]], Any] | None = struct.field(pytree_node=False, default=None)
-    traffic_bonus: Any = 0.0
-    traffic_penalty: Any = 0.0
-    per_slot: Any = 0.0
+    traffic_bonus: Scalar = 0.0
+    traffic_penalty: Scalar = 0.0
+    per_slot: Scalar = 0.0
 
 
 def make_reward(

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
 from uavmec_jax.env.dynamics import Cause, Outcome, State, initial_state, transition
 from uavmec_jax.env.generator import ScenarioDistribution, scenario_from_draw
@@ -32,10 +32,10 @@ class Episode:
         first_failure: ``[n]`` f32, share of each device in the first failure; sums to 1 unless no device failed.
     """
 
-    length: Any
-    cause: Any
-    failed: Any
-    first_failure: Any
+    length: Int[Array, "*batch"]
+    cause: Int[Array, "*batch"]
+    failed: Bool[Array, "*batch n"]
+    first_failure: Float[Array, "*batch n"]
 
 
 def slot_volumes(params: Params, n_devices: int, key: PRNGKeyArray, slot: Any) -> Array:
@@ -168,8 +168,8 @@ class Trace:
         outcome: leaves ``[H, ...]``, what each slot did.
     """
 
-    played: Any
-    action: Any
+    played: Bool[Array, "*batch H"]
+    action: Int[Array, "*batch H"]
     state: State
     outcome: Outcome
 

@@ -55,15 +55,14 @@ def _draw_slot(
     figure: Figure, evacuation: Evacuation, params: Params, layout: Layout, told: Trace, slot: int, title: str
 ) -> None:
     axes = figure.subplots(1, 3, width_ratios=(5, 1.3, 1.3))
-    elapsed = float(told.state.elapsed[slot])
+    now, limit = jax.tree.map(lambda leaf: leaf[slot], told), float(params.data_age_limit_slots)
+    elapsed, failed = float(now.state.elapsed), np.asarray(now.outcome.first_failure)
     window = min(int(elapsed // evacuation.meta["window_s"]), len(evacuation.road_density) - 1)
     _draw_traffic(axes[0], evacuation, np.asarray(layout.position), told, slot, window)
     axes[0].set_title(f"{title}: slot {slot + 1}, {elapsed / 60:.0f} min after the order", fontsize=10)
-    battery = told.state.battery[slot] / np.asarray(layout.capacity)
-    _draw_bars(axes[1], battery, np.asarray(layout.has_power), told.outcome.first_failure[slot], "battery", 1.0)
-    age = told.state.age[slot]
-    limit = float(params.data_age_limit_slots)
-    _draw_bars(axes[2], age, np.asarray(layout.has_comms), told.outcome.first_failure[slot], "age, slots", limit + 1)
+    battery = np.asarray(now.state.battery) / np.asarray(layout.capacity)
+    _draw_bars(axes[1], battery, np.asarray(layout.has_power), failed, "battery", 1.0)
+    _draw_bars(axes[2], np.asarray(now.state.age), np.asarray(layout.has_comms), failed, "age, slots", limit + 1)
     axes[2].axvline(limit, color="black", lw=0.8, ls=":")
 
 

@@ -14,7 +14,7 @@ def tour_geojson(scenario: NamedScenario, plan: Plan) -> dict[str, Any]:
     Raises:
         ScenarioError: the scenario has no place on the map.
     """
-    devices = scenario.geographic(plan.layout.position)
+    devices = scenario.geographic(np.asarray(plan.layout.position))
     visits = {name: np.bincount(tour.action, minlength=len(devices)) for name, tour in plan.tours.items()}
     points = [
         _feature(

@@ -18,7 +18,7 @@ def tour_figure(plan: Plan, names: Sequence[str], scenario: str) -> Figure:
     figure = new_figure(14, 4.2 * len(plan.tours))
     axes = figure.subplots(len(plan.tours), 3, squeeze=False)
     for (map_axis, battery_axis, age_axis), (name, tour) in zip(axes, plan.tours.items(), strict=True):
-        _map(map_axis, plan, tour.action, f"{_TITLES[name]}: {len(tour.action)} slots")
+        _map(map_axis, plan, np.asarray(tour.action), f"{_TITLES[name]}: {len(tour.action)} slots")
         slots = np.arange(len(tour.action) + 1)
         for device, label in enumerate(names):
             colour = f"C{device % 10}"

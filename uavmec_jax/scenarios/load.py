@@ -59,7 +59,7 @@ def _random_scenario(
     evacuation = None if place is None else load_evacuation(place)
     if evacuation is not None:
         params = replace(params, n_devices=evacuation.n_devices, region_m=evacuation.region_m())
-        evacuation.check_hops(params.uav_speed_m_s, params.slot_cap_s)
+        evacuation.check_hops(float(params.uav_speed_m_s), float(params.slot_cap_s))
     for name, count in (("powered", powered), ("connected", connected)):
         if not 0 <= count <= params.n_devices:
             raise ScenarioError(f"{name} is {count}; give 0 to {params.n_devices}, the number of devices")
