@@ -40,7 +40,7 @@ def test_an_episode_is_the_transition_of_the_model(env):
         action = (5 * slot) % 12
         state, outcome = step(scenario.params, scenario.layout, state, action, volumes)
         observation, reward, terminated, truncated, info = env.step(action)
-        assert_allclose(observation, observe(scenario.layout, state), rtol=1e-6)
+        assert_allclose(observation, observe(scenario.params, scenario.layout, state), rtol=1e-6)
         assert np.isfinite(reward)
         assert not truncated
         assert terminated == (outcome.cause != um.Cause.NONE)

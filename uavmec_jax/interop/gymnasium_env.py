@@ -48,7 +48,7 @@ class UavMecGymEnv(gymnasium.Env):
         self.observation_space, self.action_space = spaces(self.scenario)
         self._n = int(self.scenario.layout.capacity.shape[0])
         self._start = jax.device_get(initial_state(self.scenario.params, self.scenario.layout))
-        self._first = np.asarray(observe(self.scenario.layout, self._start))
+        self._first = np.asarray(observe(self.scenario.params, self.scenario.layout, self._start))
         self._play = jax.jit(partial(_play, self.scenario))
         self._state = self._start
         self._visited: int | None = None
@@ -91,5 +91,6 @@ def _play(scenario: Scenario, state: State, action: Any, uniform: Any) -> tuple[
     after, reward, outcome = advance(scenario, state, action, draw_volumes(scenario.params, uniform))
     truncated = is_truncated(scenario, after, outcome)
     numbers = jnp.stack([reward, outcome.cause, truncated, outcome.duration, after.slot])
-    parts = [numbers, observe(scenario.layout, after), outcome.failed, outcome.served, outcome.first_failure]
+    observation = observe(scenario.params, scenario.layout, after)
+    parts = [numbers, observation, outcome.failed, outcome.served, outcome.first_failure]
     return after, jnp.concatenate([part.astype(jnp.float32) for part in parts])
