@@ -41,7 +41,7 @@ def test_step_is_the_transition(env):
         action = (5 * slot) % 12
         state, outcome = step(scenario.params, scenario.layout, state, action, volumes)
         observation, reward, terminated, truncated, info = env.step(action)
-        assert_allclose(observation, observe(scenario.layout, state), rtol=1e-6)
+        assert_allclose(observation, observe(scenario.params, scenario.layout, state), rtol=1e-6)
         assert np.isfinite(reward)
         assert not truncated
         assert terminated == (outcome.cause != um.Cause.NONE)

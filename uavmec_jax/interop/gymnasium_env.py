@@ -53,7 +53,7 @@ class UavMecGymEnv(gymnasium.Env):
         self.observation_space, self.action_space = make_spaces(self.scenario)
         self._n = int(self.scenario.layout.capacity.shape[0])
         self._initial_state = jax.device_get(initial_state(self.scenario.params, self.scenario.layout))
-        self._initial_observation = np.asarray(observe(self.scenario.layout, self._initial_state))
+        self._initial_observation = np.asarray(observe(self.scenario.params, self.scenario.layout, self._initial_state))
         self._play_slot = jax.jit(partial(_play_slot, self.scenario))
         self._state = self._initial_state
         self._last_action: int | None = None
@@ -106,5 +106,6 @@ def _play_slot(
     after, reward, outcome = advance(scenario, state, action, draw_volumes(scenario.params, uniform))
     truncated = is_truncated(scenario, after, outcome)
     scalars = jnp.stack([reward, outcome.cause, truncated, outcome.duration, after.slot])
-    parts = [scalars, observe(scenario.layout, after), outcome.failed, outcome.served, outcome.first_failure]
+    observation = observe(scenario.params, scenario.layout, after)
+    parts = [scalars, observation, outcome.failed, outcome.served, outcome.first_failure]
     return after, jnp.concatenate([part.astype(jnp.float32) for part in parts])
