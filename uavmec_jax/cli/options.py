@@ -75,7 +75,7 @@ def scenario_options(*, argument: bool) -> Callable[[Callable], Callable]:
     """
     path = click.Path(path_type=Path)
     file = (
-        click.argument("file", metavar="SCENARIO", required=False, type=path)
+        click.argument("file", metavar="[SCENARIO]", required=False, type=path)
         if argument
         else click.option(
             "--scenario", "file", type=path, help="Scenario file (TOML or CSV) instead of a random scenario."
@@ -147,7 +147,7 @@ def run_options(command: Callable) -> Callable:
             "--checkpoint",
             type=click.Choice(CHECKPOINT_KINDS),
             default=default.checkpoint,
-            help="Contents: full, from which a shard resumes, or weights, after which it is trained from the start.",
+            help="Save the full state of a shard in training, from which it resumes, or only its weights.",
         ),
         click.option(
             "--checkpoint-every",
