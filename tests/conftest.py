@@ -1,18 +1,18 @@
-"""Every test runs with shapes and types checked at run time, and with two CPU devices."""
+"""All tests run with shapes and types checked at run time, and with two CPU devices."""
 
 import os
 import sys
 import tempfile
 
-# The same program is compiled once in a session, whichever worker, test or subprocess asks for it: the first process
-# makes the folder, the others inherit its name. AgentIds runs several sessions may give one folder to all of them.
+# A program is compiled once per session, whichever worker, test or subprocess needs it: the first process makes the cache
+# folder, the others inherit its name. Several sessions share their cache if the variable is set before they start.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     _cache = tempfile.TemporaryDirectory(prefix="uavmec-jax-tests-")
     os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache.name
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.05"
 
-# The tests start some hundred processes. Where Python is told to leave no bytecode beside the sources, each would
-# compile all that it imports again, for seconds: it is left in a folder that goes with the session.
+# The tests start about a hundred processes. If Python may not write bytecode beside the sources, each of them would compile
+# its imports again, which takes seconds, so bytecode goes to a folder that is removed with the session.
 if os.environ.pop("PYTHONDONTWRITEBYTECODE", ""):
     _bytecode = tempfile.TemporaryDirectory(prefix="uavmec-jax-bytecode-")
     os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix = _bytecode.name

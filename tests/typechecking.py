@@ -1,6 +1,6 @@
 """The run-time type checker of the tests: beartype, and the fields of every pytree that crosses a function boundary.
 
-A pytree's constructor is not checked: JAX calls it with shapes and sentinels too.
+Constructors of pytrees are not checked, since JAX also calls them with shapes and sentinels.
 """
 
 import dataclasses
@@ -18,48 +18,73 @@ _LEAVES = (jax.Array, np.ndarray, np.generic, int, float)
 
 
 def checked(function):
-    """Check arguments and result of a function; jaxtyping calls it with the signature of each function of the package."""
+    """Check the arguments and the result of a function.
+
+    jaxtyping calls this with a function that has the signature of one of the package and no body; the result of that one
+    is then a further argument.
+    """
     check = beartype(conf=_CONF)(function)
 
     @functools.wraps(function)
-    def check_call(*arguments, **named):
-        if function.__name__ == "__init__" and _is_pytree(type(arguments[0])):
+    def check_call(*args, **kwargs):
+        if function.__name__ == "__init__" and _is_pytree(type(args[0])):
             return
-        check(*arguments, **named)
-        for value in (*arguments, *named.values()):
+        check(*args, **kwargs)
+        for value in (*args, *kwargs.values()):
             check_fields(value)
 
     return check_call
 
 
 def check_fields(tree: Any) -> None:
-    """Check the fields of a pytree of the package, and of those inside it: types, and shapes that fit together.
+    """Check the fields of the package's pytrees in ``tree``: their types, and that the shapes of each fit together.
 
     Raises:
         TypeCheckError: a leaf has another dtype or shape than its field says.
     """
-    if not _is_pytree(type(tree)):
+    if _is_pytree(type(tree)):
+        types = _field_types(type(tree))
+        children = {name: getattr(tree, name) for name in types}
+        with jaxtyped("context"):
+            for name, annotation in types.items():
+                _check_leaf(f"{type(tree).__name__}.{name}", children[name], annotation)
+        children = children.values()
+    elif isinstance(tree, tuple | list):
+        children = tree
+    elif isinstance(tree, dict):
+        children = tree.values()
+    else:
         return
-    with jaxtyped("context"):
-        for field in dataclasses.fields(tree):
-            value = getattr(tree, field.name)
-            if isinstance(value, _LEAVES) and not is_bearable(value, _hint(field.type, type(value)), conf=_CONF):
-                found = f"{value.dtype}{list(value.shape)}" if hasattr(value, "shape") else repr(value)
-                raise TypeCheckError(f"{type(tree).__name__}.{field.name} is {found}; it should be {field.type}")
-    for field in dataclasses.fields(tree):
-        check_fields(getattr(tree, field.name))
+    for child in children:
+        check_fields(child)
+
+
+def _check_leaf(name: str, value: Any, annotation: Any) -> None:
+    if isinstance(value, _LEAVES) and not is_bearable(value, _hint(annotation, type(value)), conf=_CONF):
+        description = f"{value.dtype}{list(value.shape)}" if hasattr(value, "shape") else repr(value)
+        raise TypeCheckError(f"{name} is {description}; it should be {annotation}")
 
 
 def _is_pytree(kind: type) -> bool:
-    return hasattr(kind, "_flax_dataclass") and kind.__module__.startswith("uavmec_jax.")
+    """Return whether a class is a flax dataclass or a named tuple of the package."""
+    return kind.__module__.startswith("uavmec_jax.") and (
+        hasattr(kind, "_flax_dataclass") or (issubclass(kind, tuple) and hasattr(kind, "_fields"))
+    )
+
+
+@functools.cache
+def _field_types(kind: type) -> dict[str, Any]:
+    if dataclasses.is_dataclass(kind):
+        return {field.name: field.type for field in dataclasses.fields(kind)}
+    return {name: kind.__annotations__[name] for name in kind._fields}
 
 
 @functools.cache
 def _hint(annotation: Any, kind: type) -> Any:
-    """The annotation of a field, for NumPy arrays where the leaf is one."""
+    """Return the annotation of a field, in terms of NumPy arrays if the leaf is one."""
     if not issubclass(kind, np.ndarray | np.generic):
         return annotation
-    options = [_hint(one, kind) for one in get_args(annotation)]
+    options = [_hint(option, kind) for option in get_args(annotation)]
     if options:
         return functools.reduce(lambda a, b: a | b, options)
     if isinstance(annotation, type) and issubclass(annotation, AbstractArray):

@@ -1,6 +1,6 @@
 """Slots worked by hand, line by line of docs/model.md.
 
-The world of ``three_devices``: device 0 at (30, 40), 50 m from the origin; device 1 at (30, 100), 60 m from device 0, so
+The layout ``three_devices``: device 0 at (30, 40), 50 m from the origin; device 1 at (30, 100), 60 m from device 0, so
 sqrt(60^2 + 10^2) = 60.8276 m slant, within 65 m; device 2 at (330, 440). Standby 2, 3, 4 W, active 1, 1.5, 2.5 W, all
 compute 10,000 bytes/s. Unless said otherwise the UAV flies from the origin to device 0 and every task is 3 MB:
 
@@ -24,9 +24,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from tests.small_scenarios import three_devices
-from uavmec_jax.env import dynamics as physics
+from uavmec_jax.env import dynamics
 from uavmec_jax.env.dynamics import Cause, State, initial_state, transition, upload_rate
 from uavmec_jax.env.params import Params
+
+pytestmark = pytest.mark.usefixtures("with_and_without_jit")
 
 VOLUMES = jnp.full(3, 3e6)
 NO_POWER_NO_COMMS = three_devices()
@@ -35,7 +37,7 @@ NO_POWER_NO_COMMS = three_devices()
 def play(layout=NO_POWER_NO_COMMS, action=0, volumes=VOLUMES, params=None, **changes):
     params = Params(n_devices=3) if params is None else params
     state = initial_state(params, layout).replace(**changes)
-    return transition(params, layout, state, jnp.int32(action), volumes)
+    return jax.jit(transition)(params, layout, state, jnp.int32(action), volumes)
 
 
 def test_first_state():
@@ -61,20 +63,18 @@ def test_whole_slot():
 
 
 def test_shannon_rate():
-    rate = upload_rate(Params(), jnp.array([10.0, np.sqrt(3700.0)]))
+    rate = jax.jit(upload_rate)(Params(), jnp.array([10.0, np.sqrt(3700.0)]))
     assert_allclose(rate, [199_344_520.0, 15_823_116.0], rtol=1e-6)
 
 
 def test_shannon_rate_of_a_weak_signal():
     # slant 3000 m: gain 1e-5 / 8.1e13, snr 1.234568e-7; log2(1 + snr) = snr / ln 2 = 1.781105e-7 (1 + 1.2e-7 is lost in f32)
-    for rate in (upload_rate, jax.jit(upload_rate)):
-        assert_allclose(rate(Params(), jnp.array([3000.0])), [2e7 * 1.781105e-7], rtol=1e-5)
+    assert_allclose(jax.jit(upload_rate)(Params(), jnp.array([3000.0])), [2e7 * 1.781105e-7], rtol=1e-5)
 
 
 def test_log1p_is_accurate_over_the_whole_range():
     x = np.float32(10 ** np.linspace(-12, 6, 2000))
-    for log1p in (physics._log1p, jax.jit(physics._log1p)):
-        assert_allclose(log1p(jnp.asarray(x)), np.log1p(x.astype(float)), rtol=4e-7)
+    assert_allclose(jax.jit(dynamics._log1p)(jnp.asarray(x)), np.log1p(x.astype(float)), rtol=4e-7)
 
 
 def test_staying_flies_nowhere():
@@ -85,7 +85,7 @@ def test_staying_flies_nowhere():
 
 
 def test_visited_device_is_served_even_beyond_the_range():
-    # Range 5 m is less than the altitude; the visited device is in the served set all the same, its neighbour is not.
+    # A range of 5 m is less than the altitude; the visited device is served nevertheless, its neighbour is not.
     _, outcome = play(params=Params(n_devices=3, uav_signal_range_m=5.0))
     assert_array_equal(outcome.served, [True, False, False])
 
@@ -139,7 +139,7 @@ def test_data_may_be_ten_slots_old_but_not_eleven():
     assert state.slot == 1  # the failing slot counts
 
 
-def test_age_at_limit_fails_reading():
+def test_age_at_limit_fails():
     params = Params(n_devices=3, age_at_limit_fails=True)
     assert play(age=jnp.array([0, 0, 8]), params=params)[1].cause == Cause.NONE
     assert play(age=jnp.array([0, 0, 9]), params=params)[1].cause == Cause.DATA_AGE
@@ -168,7 +168,7 @@ def test_first_battery_inside_the_slot():
     assert_array_equal(play(battery=jnp.array([300.0, 6e4, 900.0]))[1].first_failure, [0, 0, 1])
 
 
-def test_slot_the_uav_cannot_pay_never_starts():
+def test_slot_beyond_the_uav_battery_never_starts():
     before = initial_state(Params(n_devices=3), NO_POWER_NO_COMMS).replace(uav_energy=jnp.float32(24_699.0))
     state, outcome = play(uav_energy=jnp.float32(24_699.0), age=jnp.array([0, 0, 10]))
     assert outcome.cause == Cause.UAV
@@ -182,21 +182,21 @@ def test_slot_the_uav_cannot_pay_never_starts():
     assert not outcome.served.any()
 
 
-def test_slot_the_uav_can_just_pay_is_played():
+def test_slot_that_empties_the_uav_battery_is_played():
     # Staying put costs exactly 24,000 J.
     state, outcome = play(uav_energy=jnp.float32(24_000.0), uav_position=jnp.array([30.0, 40.0]))
     assert outcome.cause == Cause.NONE
     assert (state.uav_energy, state.slot) == (0, 1)
 
 
-def test_count_unfinished_slot_reading():
+def test_count_unfinished_slot():
     params = Params(n_devices=3, count_unfinished_slot=True)
     state, outcome = play(uav_energy=jnp.float32(1.0), params=params)
     assert outcome.cause == Cause.UAV
     assert state.slot == 1
 
 
-def test_flight_power_adds_to_hover_reading():
+def test_flight_power_adds_to_hover():
     # 150 W * 10 s + 80 W * 300 s = 25,500 J.
     state, _ = play(params=Params(n_devices=3, flight_power_adds_to_hover=True))
     assert_allclose(state.uav_energy, 1_600_000 - 25_500, rtol=1e-7)
@@ -222,3 +222,21 @@ def test_state_is_not_changed_in_place():
     state = State(jnp.full(3, 6e4), jnp.zeros(3, jnp.int32), jnp.zeros(2), jnp.float32(1e6), jnp.int32(0))
     transition(Params(n_devices=3), NO_POWER_NO_COMMS, state, jnp.int32(0), VOLUMES)
     assert_array_equal(state.battery, [6e4] * 3)
+
+
+STATE = initial_state(Params(n_devices=3), NO_POWER_NO_COMMS)
+WRONG_SHAPES = {
+    "volumes of four devices": {"volumes": jnp.full(4, 3e6)},
+    "batch of volumes": {"volumes": jnp.full((2, 3), 3e6)},
+    "batch of actions": {"action": jnp.array([0, 1])},
+    "state of four devices": {"state": STATE.replace(battery=jnp.full(4, 6e4), age=jnp.zeros(4, jnp.int32))},
+    "batch of layouts": {"layout": jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), NO_POWER_NO_COMMS)},
+}
+
+
+@pytest.mark.usefixtures("without_type_checks")
+@pytest.mark.parametrize("changes", WRONG_SHAPES.values(), ids=WRONG_SHAPES)
+def test_shapes_that_do_not_fit_together_are_refused(changes):
+    arguments = {"layout": NO_POWER_NO_COMMS, "state": STATE, "action": jnp.int32(0), "volumes": VOLUMES, **changes}
+    with pytest.raises(AssertionError, match=r"shape|rank"):
+        jax.jit(transition)(Params(n_devices=3), **arguments)

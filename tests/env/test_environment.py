@@ -1,5 +1,6 @@
 """The environment: signatures, auto-reset, observation, known lifetimes, invariants."""
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
+from tests.populations import stack, take
 from uavmec_jax.env.dynamics import Cause, initial_state, transition
 from uavmec_jax.env.environment import UavMecEnv
 from uavmec_jax.env.layout import sample_layout
@@ -21,11 +23,14 @@ from uavmec_jax.planning.observation import FEATURES, observe_devices
 ENV = UavMecEnv()
 PARAMS = Params()
 
+both_modes = pytest.mark.usefixtures("with_and_without_jit")
+
 
 def layout_of(seed, powered=8, connected=8, params=PARAMS):
     return sample_layout(jax.random.key(seed), params, powered, connected)
 
 
+@both_modes
 def test_first_observation_is_ones_then_zeros():
     observation, state = ENV.reset(jax.random.key(0))
     assert_array_equal(observation, [1.0] * 12 + [0.0] * 12)
@@ -35,7 +40,8 @@ def test_first_observation_is_ones_then_zeros():
     assert ENV.observation_shape(ENV.default_params) == (24,)
 
 
-def test_step_resets_by_itself_and_keeps_the_true_last_observation():
+@both_modes
+def test_step_resets_automatically_and_keeps_the_final_observation():
     scenario = make_scenario(layout_of(0, 12, 0))
     observation, state = ENV.reset(jax.random.key(0), scenario)
     for slot in range(11):
@@ -51,6 +57,7 @@ def test_step_resets_by_itself_and_keeps_the_true_last_observation():
     assert state.slot == 0
 
 
+@both_modes
 def test_time_limit_truncates():
     scenario = make_scenario(layout_of(0, 12, 12), Params(max_slots=3))
     _, state = ENV.reset(jax.random.key(0), scenario)
@@ -65,9 +72,8 @@ def test_time_limit_truncates():
 def test_everything_powered_and_connected_lives_33_slots():
     # 1,600 kJ / (80 W x 600 s) = 33.3 slots, if at least one device computes for the full 600 s.
     keys = jax.random.split(jax.random.key(0), 20)
-    episodes = jax.vmap(lambda key: rollout(HEURISTICS["stay-put"], PARAMS, sample_layout(key, PARAMS, 12, 12), key))(
-        keys
-    )
+    play = lambda key: rollout(HEURISTICS["stay-put"], PARAMS, sample_layout(key, PARAMS, 12, 12), key)  # noqa: E731
+    episodes = jax.jit(jax.vmap(play))(keys)
     assert_array_equal(episodes.length, 33)
     assert_array_equal(episodes.cause, Cause.UAV)
     assert not episodes.failed.any()
@@ -75,13 +81,14 @@ def test_everything_powered_and_connected_lives_33_slots():
 
 @pytest.mark.slow
 def test_nothing_powered_or_connected_lives_11_slots_without_shared_hover_points():
-    params = Params(uav_signal_range_m=11.0)  # altitude 10 m: nobody within 4.6 m on the ground
+    params = Params(uav_signal_range_m=11.0)  # altitude 10 m: no other device within 4.6 m on the ground
     keys = jax.random.split(jax.random.key(0), 20)
     for policy in HEURISTICS.values():
         episodes = jax.vmap(lambda key, p=policy: rollout(p, params, sample_layout(key, params, 0, 0), key))(keys)
         assert_array_equal(episodes.length, 11)
 
 
+@both_modes
 def test_rollout_gives_two_policies_the_same_volumes():
     seen = {}
 
@@ -108,7 +115,7 @@ def test_rollouts_differ_by_draw_and_repeat_by_key():
     keys = jax.random.split(jax.random.key(0), 16)
     first = rollouts(oldest_first, PARAMS, layout_of(5, 4, 4), keys)
     again = rollouts(oldest_first, PARAMS, layout_of(5, 4, 4), keys)
-    jax.tree.map(assert_array_equal, first, again)
+    chex.assert_trees_all_equal(first, again)
     alone = rollout(oldest_first, PARAMS, layout_of(5, 4, 4), keys[3])
     assert alone.length == first.length[3]
     durations = [
@@ -130,10 +137,9 @@ def test_jit_and_vmap_change_nothing():
     step = lambda *args: transition(PARAMS, *args)  # noqa: E731
     batched = jax.vmap(step)(layouts, states, actions, volumes)
     jitted = jax.jit(jax.vmap(step))(layouts, states, actions, volumes)
-    for i in range(5):
-        alone = step(*(jax.tree.map(lambda leaf, i=i: leaf[i], (layouts, states, actions, volumes))))
-        for many in (batched, jitted):
-            jax.tree.map(lambda a, b, i=i: assert_allclose(a, b[i], rtol=2e-6), alone, many)
+    alone = [step(*take((layouts, states, actions, volumes), i)) for i in range(5)]
+    for many in (batched, jitted):
+        chex.assert_trees_all_close(stack(alone), many, rtol=2e-6)
 
 
 states = st.fixed_dictionaries(
@@ -181,6 +187,15 @@ def test_invariants_of_random_play(case):
             break
 
 
+def test_one_program_serves_all_scenarios_of_one_size():
+    step = jax.jit(chex.assert_max_traces(transition, n=1))
+    for params, layout in (
+        (PARAMS, layout_of(0)),
+        (PARAMS.replace(uav_speed_m_s=8.0, max_slots=5), layout_of(1, 4, 12)),
+    ):
+        step(params, layout, initial_state(params, layout), jnp.int32(0), jnp.full(12, 3e6))
+
+
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10_000), st.integers(0, 11))
 def test_renumbering_the_devices_renumbers_the_outcome(seed, action):
@@ -201,21 +216,21 @@ def test_renumbering_the_devices_renumbers_the_outcome(seed, action):
 @pytest.mark.parametrize("seed", [0, 1])
 def test_seeds_differ_and_repeat(seed):
     same = layout_of(seed), layout_of(seed)
-    jax.tree.map(assert_array_equal, *same)
+    chex.assert_trees_all_equal(*same)
     assert (layout_of(seed).position != layout_of(seed + 1).position).any()
 
 
 @pytest.mark.slow
-def test_another_way_to_see():
-    """The environment with the full observation plays the same slots, and tells the true last observation likewise."""
+def test_another_observation_fn():
+    """With the full observation the environment plays the same slots and also returns the final observation."""
     scenario = make_scenario()
-    plain, full = UavMecEnv(), UavMecEnv(see=observe_devices)
+    plain, full = UavMecEnv(), UavMecEnv(observation_fn=observe_devices)
     assert full.observation_shape(scenario).features == (12, len(FEATURES))
-    seen, state = full.reset(jax.random.key(0), scenario)
+    observation, state = full.reset(jax.random.key(0), scenario)
     _, same = plain.reset(jax.random.key(0), scenario)
     for number in range(12):  # visiting one device over and over: the data of the others expire
         key = jax.random.key(number)
-        seen, state, reward, ended, _, info = full.step(key, state, 3, scenario)
+        observation, state, reward, ended, _, info = full.step(key, state, 3, scenario)
         _, same, other_reward, other_end, _, _ = plain.step(key, same, 3, scenario)
         assert (float(reward), bool(ended)) == (float(other_reward), bool(other_end))
         if ended:
@@ -223,5 +238,5 @@ def test_another_way_to_see():
     assert bool(ended)
     age = [feature.name for feature in FEATURES].index("age")
     assert float(jnp.max(info["final_observation"].features[:, age])) == 1.0
-    assert float(jnp.max(seen.features[:, age])) == 0.0
+    assert float(jnp.max(observation.features[:, age])) == 0.0
     assert_array_equal(state.age, same.age)

@@ -1,28 +1,29 @@
 """Tables and random layouts."""
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from uavmec_jax.env import hardware as tables
-from uavmec_jax.env.layout import make_layout, sample_layout
+from uavmec_jax.env import hardware
+from uavmec_jax.env.layout import make_layout, pad_layout, sample_layout
 from uavmec_jax.env.params import Params
 
 
 def test_tables_spot_checks():
     # Table 2: YOLOv3 on a Firefly 3.07 W; Table 3: DNN on a NanoPC-T4 973.1 bytes/s; Table 1: Jetson Nano standby 2.82 W.
-    kind, task = tables.DEVICE_TYPES.index, tables.TASKS.index
-    assert tables.ACTIVE_POWER_W[task("YOLOv3"), kind("Firefly")] == np.float32(3.07)
-    assert tables.PROCESSING_RATE_BYTES_S[task("DNN"), kind("NanoPC-T4")] == np.float32(973.1)
-    assert tables.STANDBY_POWER_W[kind("Jetson Nano")] == np.float32(2.82)
-    assert tables.ACTIVE_POWER_W.shape == tables.PROCESSING_RATE_BYTES_S.shape == (5, 5)
+    kind, task = hardware.DEVICE_TYPES.index, hardware.TASKS.index
+    assert hardware.ACTIVE_POWER_W[task("YOLOv3"), kind("Firefly")] == np.float32(3.07)
+    assert hardware.PROCESSING_RATE_BYTES_S[task("DNN"), kind("NanoPC-T4")] == np.float32(973.1)
+    assert hardware.STANDBY_POWER_W[kind("Jetson Nano")] == np.float32(2.82)
+    assert hardware.ACTIVE_POWER_W.shape == hardware.PROCESSING_RATE_BYTES_S.shape == (5, 5)
 
 
 def test_make_layout_looks_up_the_hardware():
-    yes = jnp.ones(2, bool)
-    layout = make_layout(jnp.zeros((2, 2)), jnp.array([2, 4]), jnp.array([4, 2]), jnp.ones(2), yes, yes)
+    resources = jnp.ones(2, bool)
+    layout = make_layout(jnp.zeros((2, 2)), jnp.array([2, 4]), jnp.array([4, 2]), jnp.ones(2), resources, resources)
     assert_array_equal(layout.standby_power, np.float32([4.87, 1.88]))
     assert_array_equal(layout.active_power, np.float32([3.07, 2.595]))
     assert_array_equal(layout.processing_rate, np.float32([2733.97, 973.1]))
@@ -56,9 +57,23 @@ def test_masks_are_uniform_and_independent():
     assert abs((power & comms).mean() - 2 / 9) < 0.01
 
 
-def test_fewer_powered_devices_are_the_same_town():
+def test_a_lower_count_changes_the_mask_alone():
     key = jax.random.key(3)
     some, fewer = sample_layout(key, Params(), 8, 6), sample_layout(key, Params(), 6, 6)
-    assert_array_equal(some.position, fewer.position)
-    assert_array_equal(some.has_comms, fewer.has_comms)
+    chex.assert_trees_all_equal(some.replace(has_power=None), fewer.replace(has_power=None))
     assert (some.has_power | ~fewer.has_power).all()
+
+
+@pytest.mark.usefixtures("without_type_checks")
+def test_shapes_that_do_not_fit_together_are_refused():
+    layout = sample_layout(jax.random.key(0), Params(), 4, 8)
+    fields = layout.position, layout.device_type, layout.task, layout.capacity, layout.has_power, layout.has_comms
+    batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), layout)
+    with pytest.raises(AssertionError, match="rank"):
+        pad_layout(batch, 16)
+    with pytest.raises(AssertionError, match="rank"):
+        sample_layout(jax.random.key(0), Params(), jnp.array([4, 5]), 8)
+    with pytest.raises(AssertionError, match="shape"):
+        make_layout(*fields[:-1], layout.has_comms[:11])
+    with pytest.raises(AssertionError, match="shape"):
+        make_layout(layout.position[:, :1], *fields[1:])

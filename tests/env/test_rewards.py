@@ -34,7 +34,7 @@ EXPECTED = {
 }
 
 
-def test_there_are_the_eleven_of_table_6():
+def test_the_rewards_are_the_eleven_of_table_6():
     assert list(REWARDS) == list(EXPECTED)
     assert all(weights.shape == (8,) for weights in REWARDS.values())
 
@@ -70,12 +70,12 @@ def test_empty_battery_is_finite(guard):
     assert_allclose(value, np.log(1e-6), rtol=1e-6)
 
 
-def test_own_weights():
+def test_custom_weights():
     reward = make_reward({"U": 2.0, "O": -0.5})
     assert_allclose(reward_of(reward, LAYOUT, BEFORE, jnp.int32(1), AFTER), 2 * 5 - 0.5 * 7, rtol=1e-6)
 
 
-def test_bad_names_are_named():
+def test_errors_name_what_is_unknown():
     with pytest.raises(ValueError, match="unknown reward 'X'"):
         make_reward("X")
     with pytest.raises(ValueError, match="unknown reward term 'Q'"):

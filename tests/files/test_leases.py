@@ -1,4 +1,4 @@
-"""AgentIds holds a shard: one at a time, whatever the clocks say; the dead lose it, the sleeping find out."""
+"""Leases: one holder at a time whatever the clocks say; dead holders lose the lease, suspended ones notice."""
 
 import json
 import threading
@@ -15,15 +15,15 @@ pytestmark = pytest.mark.slow
 QUICK = 0.8
 
 
-def elsewhere(lease):
+def move_elsewhere(lease):
     """Make a lease look like that of a process on another machine, which has died."""
     lease._ended.set()
     lease._thread.join()
-    facts = json.loads(lease.path.read_text())
-    lease.path.write_text(json.dumps(facts | {"machine": "other 0123", "pid": 7}))
+    content = json.loads(lease.path.read_text())
+    lease.path.write_text(json.dumps(content | {"machine": "other 0123", "pid": 7}))
 
 
-def test_one_holds_it_until_it_lets_go(tmp_path):
+def test_one_process_holds_it_until_it_releases_it(tmp_path):
     mine, other = Leases(), Leases()
     lease = mine.claim(tmp_path / "shard")
     assert other.claim(tmp_path / "shard") is None
@@ -38,23 +38,23 @@ def test_one_holds_it_until_it_lets_go(tmp_path):
     again.release()
 
 
-def test_of_many_at_once_one_gets_it(tmp_path):
-    got, ready = [], threading.Barrier(8)
+def test_one_of_many_concurrent_claims_succeeds(tmp_path):
+    leases, ready = [], threading.Barrier(8)
 
     def claim():
         ready.wait()
-        got.append(Leases().claim(tmp_path / "shard"))
+        leases.append(Leases().claim(tmp_path / "shard"))
 
     threads = [threading.Thread(target=claim) for _ in range(8)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    (winner,) = [lease for lease in got if lease is not None]
+    (winner,) = [lease for lease in leases if lease is not None]
     winner.release()
 
 
-def test_a_process_that_is_gone_from_this_machine_loses_it_at_once(tmp_path, monkeypatch):
+def test_a_process_that_has_ended_on_this_machine_loses_it_at_once(tmp_path, monkeypatch):
     lease = Leases().claim(tmp_path)
     assert Leases().claim(tmp_path) is None
     monkeypatch.setattr(module.psutil, "pid_exists", lambda pid: False)
@@ -62,16 +62,16 @@ def test_a_process_that_is_gone_from_this_machine_loses_it_at_once(tmp_path, mon
     lease.release()
 
 
-def test_a_process_number_that_has_gone_to_another_process_is_no_holder(tmp_path, monkeypatch):
+def test_a_reused_process_number_is_no_holder(tmp_path, monkeypatch):
     lease = Leases().claim(tmp_path)
     monkeypatch.setattr(module, "_born", lambda pid: "another")
     assert Leases().claim(tmp_path).number == 2
     lease.release()
 
 
-def test_on_another_machine_it_takes_a_whole_lease_without_a_beat(tmp_path):
+def test_a_holder_on_another_machine_is_stale_after_a_whole_lease_without_a_heartbeat(tmp_path):
     lease = Leases(QUICK).claim(tmp_path)
-    elsewhere(lease)
+    move_elsewhere(lease)
     other = Leases(QUICK)
     assert other.claim(tmp_path) is None  # seen for the first time: it may be alive
     time.sleep(QUICK / 2)
@@ -80,13 +80,13 @@ def test_on_another_machine_it_takes_a_whole_lease_without_a_beat(tmp_path):
     assert other.claim(tmp_path).number == 2
 
 
-def test_whoever_wants_to_hold_it_waits_for_a_sign_of_life(tmp_path):
+def test_hold_waits_for_a_heartbeat(tmp_path):
     lease = Leases(QUICK).claim(tmp_path)
-    elsewhere(lease)
+    move_elsewhere(lease)
     assert Leases(QUICK).hold(tmp_path, tmp_path).number == 2
 
 
-def test_beats_keep_it(tmp_path):
+def test_heartbeats_keep_it(tmp_path):
     lease = Leases(QUICK).claim(tmp_path)
     lease.progress["steps"] = 5
     other = Leases(QUICK)
@@ -108,14 +108,14 @@ def test_a_clock_that_jumps_changes_nothing(tmp_path, monkeypatch, jump):
     time.sleep(QUICK / 2)
     assert other.claim(tmp_path) is None
     lease.check()
-    elsewhere(lease)
+    move_elsewhere(lease)
     assert other.claim(tmp_path) is None
     time.sleep(1.2 * QUICK)
     assert other.claim(tmp_path).number == 2
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[1]", b"\xff\xfe"])
-def test_a_damaged_lease_is_somebodys_until_its_time_is_over(tmp_path, content):
+def test_a_damaged_lease_holds_until_it_is_stale(tmp_path, content):
     (tmp_path / "lease-0003.json").write_bytes(content)
     other = Leases(QUICK)
     assert other.claim(tmp_path) is None
@@ -123,7 +123,7 @@ def test_a_damaged_lease_is_somebodys_until_its_time_is_over(tmp_path, content):
     assert other.claim(tmp_path).number == 4
 
 
-def test_what_status_makes_of_it(tmp_path):
+def test_is_stale_after_the_release(tmp_path):
     lease = Leases().claim(tmp_path)
     assert not is_stale(read_lease(tmp_path), 60)
     lease.release()

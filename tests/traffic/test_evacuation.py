@@ -101,7 +101,7 @@ def test_files_that_are_no_evacuations(tmp_path):
     path.write_bytes(b"<osm/>")
     refused("cannot be read")
     np.savez(path, weight=np.zeros(3))
-    refused("is not an evacuation, or one from before")
+    refused("is not an evacuation: it has no valid header")
     write_checked(path, 2, {"meta": {}}, {})
     refused("schema is 2; this version reads 1")
     write_checked(path, 1, {"meta": {}}, {"weight": np.zeros(3)})

@@ -1,1 +1,1 @@
-"""Readers with limits, atomic writes, checked archives and locks. Imports nothing of ours but the errors."""
+"""Readers with limits, atomic writes, checked archives and locks; of our package they import the errors alone."""

@@ -1,4 +1,4 @@
-"""Named arrays in checked archives: read without pickle, with a schema and a SHA-256."""
+"""Named arrays in checked archives: NumPy's ``.npz`` without pickle, with a header, a schema and a SHA-256."""
 
 import hashlib
 import json
@@ -6,7 +6,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from importlib import metadata
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -15,78 +15,85 @@ import numpy as np
 from uavmec_jax.errors import StudyError, UserError
 from uavmec_jax.files.writing import write_arrays
 
-_DAMAGE = (OSError, ValueError, EOFError, AttributeError, NotImplementedError, zipfile.BadZipFile, zlib.error)
-"""What zipfile, zlib and NumPy raise on files that are damaged or something else (an unknown compression is
-``NotImplementedError``, a bare array where an archive should be ``AttributeError``)."""
+_READ_ERRORS = (OSError, ValueError, EOFError, AttributeError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+"""Errors that zipfile, zlib and NumPy raise for damaged files and for files of another kind (an unknown compression is
+``NotImplementedError``, a bare array in place of an archive is ``AttributeError``)."""
+
+_HEADER = "header"
+"""Name of the archive's member that holds the header as JSON."""
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read named arrays; each member's CRC is checked.
+    """Read named arrays and check the CRC of each.
 
     Raises:
-        StudyError: the file is not there, is no such file, or is damaged.
+        StudyError: the file is missing, damaged or of another kind.
     """
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
-    except _DAMAGE as error:
+    except _READ_ERRORS as error:
         raise StudyError(f"{path}: cannot be read: {error}") from None
-
-
-_HEADER = "header"
 
 
 def write_checked(
     path: Path,
     schema: int,
-    facts: Mapping[str, Any],
+    metadata: Mapping[str, Any],
     arrays: Mapping[str, np.ndarray],
     *,
     compressed: bool = True,
 ) -> None:
-    """Write named arrays under a header of facts (what JSON can hold), schema and SHA-256, atomic or not at all."""
-    header = {"schema": schema, "package": f"uavmec-jax {metadata.version('uavmec-jax')}", **facts}
+    """Write named arrays and a header atomically.
+
+    Args:
+        path: the file.
+        schema: version of the format; :func:`read_checked` refuses other versions.
+        metadata: what the header holds besides schema, package version and SHA-256; values that JSON can represent.
+        arrays: the arrays by name.
+        compressed: whether to compress them.
+    """
+    header = {"schema": schema, "package": f"uavmec-jax {version('uavmec-jax')}", **metadata}
     header["sha256"] = _digest(header, arrays)
     write_arrays(path, {_HEADER: np.array(json.dumps(header)), **arrays}, compressed=compressed)
 
 
 def read_checked(
-    path: Path, schema: int, what: str, error: type[UserError]
+    path: Path, schema: int, kind: str, error: type[UserError]
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The facts and the arrays that :func:`write_checked` wrote; see :func:`open_checked`."""
-    with open_checked(path, schema, what, error) as (facts, arrays):
-        return facts, dict(arrays)
+    """Read and check the header and the arrays that :func:`write_checked` wrote; see :func:`open_checked`."""
+    with open_checked(path, schema, kind, error) as (header, arrays):
+        return header, dict(arrays)
 
 
 @contextmanager
 def open_checked(
-    path: Path, schema: int, what: str, error: type[UserError]
+    path: Path, schema: int, kind: str, error: type[UserError]
 ) -> Iterator[tuple[dict[str, Any], Mapping[str, np.ndarray]]]:
-    """The facts that :func:`write_checked` wrote, and its arrays, each read when it is asked for.
+    """Open and check an archive of :func:`write_checked`; yield its header and its arrays, which are read on access.
 
-    All of them are checked first, one at a time: an archive may be larger than the memory that is free.
+    The SHA-256 is computed first, one array at a time, since an archive may be larger than the free memory.
 
     Args:
         path: the file.
-        schema: the version that is read.
-        what: the file should be, for messages.
-        error: what is raised.
+        schema: the version of the format that the caller reads.
+        kind: what the file should be, for messages, such as ``"a checkpoint"``.
+        error: the type of the errors.
 
     Raises:
-        UserError: the file is not there, is damaged, was altered, is something else or of another version.
+        UserError: the file is missing, damaged, altered, of another kind or of another version; of the type ``error``.
     """
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            facts = _checked_facts(path, archive, schema, what, error)
-            yield facts, _Members(archive)
+            yield _check_header(path, archive, schema, kind, error), _Members(archive)
     except UserError:
         raise
-    except _DAMAGE as damage:
-        raise error(f"{path}: cannot be read: {damage}") from None
+    except _READ_ERRORS as problem:
+        raise error(f"{path}: cannot be read: {problem}") from None
 
 
 class _Members(Mapping[str, np.ndarray]):
-    """The arrays of an archive, without its header."""
+    """The arrays of an archive, without its header, each read on access."""
 
     def __init__(self, archive: Any) -> None:
         self._archive = archive
@@ -104,21 +111,23 @@ class _Members(Mapping[str, np.ndarray]):
         return len(self._names)
 
 
-def _checked_facts(path: Path, archive: Any, schema: int, what: str, error: type[UserError]) -> dict[str, Any]:
+def _check_header(path: Path, archive: Any, schema: int, kind: str, error: type[UserError]) -> dict[str, Any]:
+    """Return the header of an archive, without its SHA-256, after checking both against the arrays."""
     try:
-        facts: dict[str, Any] = json.loads(str(archive[_HEADER]))
-        found, digest = facts["schema"], facts.pop("sha256")
+        header: dict[str, Any] = json.loads(str(archive[_HEADER]))
+        file_schema, digest = header["schema"], header.pop("sha256")
     except (KeyError, ValueError, TypeError):
-        raise error(f"{path}: is not {what}, or one from before they had a header") from None
-    if found != schema:
-        raise error(f"{path}: schema is {found!r}; this version reads {schema}")
-    if digest != _digest(facts, _Members(archive)):
+        raise error(f"{path}: is not {kind}: it has no valid header") from None
+    if file_schema != schema:
+        raise error(f"{path}: schema is {file_schema!r}; this version reads {schema}")
+    if digest != _digest(header, _Members(archive)):
         raise error(f"{path}: was altered: its contents do not fit their SHA-256")
-    return facts
+    return header
 
 
-def _digest(facts: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
-    digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
+def _digest(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
+    """Return the SHA-256 of a header and of the names, dtypes, shapes and bytes of the arrays."""
+    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(arrays):
         leaf = np.ascontiguousarray(arrays[name])
         digest.update(f"{name} {leaf.dtype.str} {leaf.shape}".encode())

@@ -1,10 +1,10 @@
-"""AgentIds works on what in a folder that several processes and hosts share.
+"""Leases on the parts of a folder that several processes and hosts share.
 
-A lease is a numbered file. To claim, a process creates the next number, which only one can; the highest number holds.
-The holder writes a new heartbeat into its file every few seconds. Others take over when the holder is known to be dead (its
-process is gone on this very machine), when it has let go, or when they have seen no new heartbeat for the lease's atomic
-time by their own monotonic clock; so neither clocks that differ nor clocks that jump matter. A holder that was only
-asleep finds a higher number and stops (Gray and Cheriton, 1989; the number is a fencing token).
+A lease is a numbered file. To claim it, a process creates the next number, which only one process can; the highest number
+holds. The holder writes a heartbeat into its file every few seconds. Others take over when the holder is known to be dead
+(its process has ended on this machine), when it has released the lease, or when it is stale: they have seen no new
+heartbeat for the length of the lease by their own monotonic clock, so clocks that differ or jump do no harm. A holder that
+was only suspended finds a higher number and stops (Gray and Cheriton, 1989; the number is a fencing token).
 """
 
 import json
@@ -24,17 +24,17 @@ from uavmec_jax.files.reading import read_json_or_empty
 from uavmec_jax.files.writing import atomic
 
 LEASE_S = 60.0
-"""Seconds without a heartbeat after which a holder on another machine counts as dead."""
+"""Seconds without a heartbeat after which a holder on another machine is stale."""
 
-_BEATS_PER_LEASE = 6
+_HEARTBEATS_PER_LEASE = 6
 
 
 class LeaseLostError(StudyError):
-    """Somebody else has taken over."""
+    """Another process has taken over the lease."""
 
 
 def this_machine() -> str:
-    """Host name and an identity of the running system: a name alone may be that of another machine."""
+    """Return the host name and the identity of the running system, since several machines may share a name."""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     except OSError:
@@ -43,19 +43,19 @@ def this_machine() -> str:
 
 
 def describe_holder(holder: dict[str, Any]) -> str:
-    """A holder in words."""
+    """Return a holder in words."""
     return f"process {holder.get('pid', '?')} on {str(holder.get('machine', 'an unknown machine')).split()[0]}"
 
 
 @dataclass
 class Lease:
-    """A claim that is held. A thread of its own writes the heartbeats.
+    """A lease that this process holds; a thread writes its heartbeats.
 
     Attributes:
-        folder: what is claimed.
-        number: of the claim.
-        lease_s: seconds without a heartbeat after which it is lost.
-        progress: what each heartbeat reports besides, e.g. steps.
+        folder: the folder that is claimed.
+        number: the number of the claim.
+        lease_s: seconds without a heartbeat after which the lease is stale.
+        progress: what each heartbeat reports in addition, such as steps.
     """
 
     folder: Path
@@ -72,61 +72,61 @@ class Lease:
 
     @property
     def path(self) -> Path:
-        """The file."""
+        """The file of the lease."""
         return _file(self.folder, self.number)
 
     def check(self) -> None:
-        """Go on only as the holder.
+        """Check that this process still holds the lease.
 
         Raises:
-            LeaseLostError: somebody else has taken over.
+            LeaseLostError: another process has taken over.
         """
         if _file(self.folder, self.number + 1).exists() or not self.path.exists():
             raise LeaseLostError(f"{self.folder}: {describe_holder(read_lease(self.folder))} has taken over")
 
     def release(self) -> None:
-        """Let go: whoever comes next need not wait."""
+        """Release the lease, so that the next process need not wait."""
         self._ended.set()
         self._thread.join()
         self._write(released=True)
 
     def _write_heartbeats(self) -> None:
-        while not self._ended.wait(self.lease_s / _BEATS_PER_LEASE):
+        while not self._ended.wait(self.lease_s / _HEARTBEATS_PER_LEASE):
             self._write()
 
-    def _write(self, **facts: Any) -> None:
+    def _write(self, **fields: Any) -> None:
         with self._writing:
             self._heartbeats += 1
-            text = json.dumps(_facts() | {"heartbeat": self._heartbeats} | self.progress | facts)
+            text = json.dumps(_identity() | {"heartbeat": self._heartbeats} | self.progress | fields)
             try:
                 with atomic(self.path) as partial:
                     partial.write_text(text, encoding="utf-8")
-            except OSError:  # a full disk, a server that is away: others may take over, and `check` then tells
+            except OSError:  # full disk, file server gone: others may take over, which `check` then reports
                 return
 
 
 class Leases:
-    """Claims leases, and remembers the heartbeats that it has seen of others."""
+    """Claims leases and remembers the heartbeats of other holders."""
 
     def __init__(self, lease_s: float = LEASE_S) -> None:
         self.lease_s = lease_s
         self._seen: dict[Path, tuple[bytes, float]] = {}
 
     def claim(self, folder: Path) -> Lease | None:
-        """Claim a folder; ``None`` if somebody holds it."""
+        """Claim a folder; return ``None`` if another process holds it."""
         latest = _latest(folder)
         if latest and self.holder(folder) is not None:
             return None
         folder.mkdir(parents=True, exist_ok=True)
         try:
             with _file(folder, latest + 1).open("x", encoding="utf-8") as file:
-                file.write(json.dumps(_facts() | {"heartbeat": 0}))
+                file.write(json.dumps(_identity() | {"heartbeat": 0}))
         except FileExistsError:
             return None
         return Lease(folder, latest + 1, self.lease_s)
 
     def holder(self, folder: Path) -> dict[str, Any] | None:
-        """AgentIds holds a folder, as far as this process can tell by now; ``None`` if nobody does."""
+        """Return the holder of a folder as far as this process can tell, ``None`` if there is none."""
         latest = _latest(folder)
         if not latest:
             return None
@@ -145,15 +145,15 @@ class Leases:
         return None if dead else holder
 
     def hold(self, folder: Path, of: Path, more: str = "") -> Lease:
-        """Claim a folder, or refuse; a holder on another machine that may be dead is watched for as long as it takes.
+        """Claim a folder or fail; wait if its holder is on another machine and may be dead.
 
         Args:
-            folder: what is claimed.
-            of: what it is the folder of, for the message.
-            more: said after it.
+            folder: the folder to claim.
+            of: what the message names in place of the folder.
+            more: added to the end of the message.
 
         Raises:
-            StudyError: somebody holds it, and is alive.
+            StudyError: another process holds the folder and is alive.
         """
         first: dict[str, Any] | None = None
         while (lease := self.claim(folder)) is None:
@@ -167,12 +167,12 @@ class Leases:
         return lease
 
     def taken_over(self, folder: Path) -> bool:
-        """Whether a claim would not be the first one."""
+        """Return whether the folder has been claimed before."""
         return _latest(folder) > 0
 
 
 def _is_known_dead(holder: dict[str, Any]) -> bool:
-    """Whether the process was one of this machine, and is gone, or its number has gone to another one."""
+    """Return whether the holder was a process of this machine that has ended; its number may have been reused."""
     if holder.get("machine") != this_machine():
         return False
     pid = holder.get("pid", -1)
@@ -180,14 +180,14 @@ def _is_known_dead(holder: dict[str, Any]) -> bool:
 
 
 def _born(pid: int) -> str | None:
-    """When a process was started, in ticks since the machine was: no clock can change it. ``None`` beyond Linux."""
+    """Return when a process started, in ticks since the machine did, which no clock changes; ``None`` if not on Linux."""
     try:
         return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[19]
     except (OSError, IndexError):
         return None
 
 
-def _facts() -> dict[str, Any]:
+def _identity() -> dict[str, Any]:
     pid = os.getpid()
     return {"machine": this_machine(), "pid": pid, "born": _born(pid), "at": time.time()}
 
@@ -197,16 +197,16 @@ def _file(folder: Path, number: int) -> Path:
 
 
 def _latest(folder: Path) -> int:
-    """The highest claim, 0 if there is none."""
+    """Return the number of the latest claim, 0 if there is none."""
     return max((int(path.stem.removeprefix("lease-")) for path in folder.glob("lease-[0-9]*.json")), default=0)
 
 
 def read_lease(folder: Path) -> dict[str, Any]:
-    """What the latest claim's file says, whether it still holds or not; empty if there is none."""
+    """Read the file of the latest claim, whether it still holds or not; empty if there is none."""
     latest = _latest(folder)
     return read_json_or_empty(_file(folder, latest)) if latest else {}
 
 
 def is_stale(lease: dict[str, Any], lease_s: float) -> bool:
-    """Whether the holder is gone, as far as one look can tell: for display, by the clocks of both machines."""
+    """Return whether the holder has ended or is stale by the clocks of both machines; for display only."""
     return bool(_is_known_dead(lease) or lease.get("released") or time.time() - lease.get("at", 0) > lease_s)

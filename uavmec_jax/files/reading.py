@@ -1,4 +1,4 @@
-"""Text, JSON and TOML files from outside, read with one clear line for what is wrong."""
+"""Readers of text, JSON and TOML files whose errors are one line that names the file."""
 
 import json
 import tomllib
@@ -9,10 +9,10 @@ from uavmec_jax.errors import UserError
 
 
 def read_text(path: Path, error: type[UserError], encoding: str = "utf-8") -> str:
-    """A text file.
+    """Read a text file.
 
     Raises:
-        UserError: it cannot be read; of the type ``error``.
+        UserError: the file cannot be read or decoded; of the type ``error``.
     """
     try:
         return path.read_text(encoding=encoding)
@@ -22,19 +22,19 @@ def read_text(path: Path, error: type[UserError], encoding: str = "utf-8") -> st
 
 
 def read_json_or_empty(path: Path) -> dict[str, Any]:
-    """What a small JSON file says that others may just be writing; nothing if it is not there, or damaged."""
+    """Read a small JSON object that another process may be writing; empty if it is missing or damaged."""
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return content if isinstance(content, dict) else {}
 
 
 def parse_toml(text: str, source: object, error: type[UserError]) -> dict[str, Any]:
-    """What a TOML file holds; ``source`` names it in messages.
+    """Parse the text of a TOML file; ``source`` names it in messages.
 
     Raises:
-        UserError: it is not TOML; of the type ``error``.
+        UserError: the text is not TOML; of the type ``error``.
     """
     try:
         return tomllib.loads(text)

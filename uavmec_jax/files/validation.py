@@ -1,38 +1,41 @@
-"""Settings from files, checked: strict models, and one clear line for the first value that does not fit."""
+"""Validation of settings from files: strict pydantic models, and errors described in one line."""
 
 import dataclasses
 import difflib
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Annotated, Any, Literal, get_args
 
 import pydantic
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, create_model
 
 from_array = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
-"""For fields that are tuples: TOML and JSON know arrays only, and strict models do not convert them."""
+"""Converts lists for fields that are tuples: TOML and JSON have arrays only, and strict models do not convert them."""
 
 Range = Annotated[tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]], from_array]
 """``[low, high]``."""
 
 _BOUNDS = ("gt", "ge", "lt", "le")
 _TYPE_TAGS = ("int", "str", "float", "bool")
-"""What pydantic adds to the location of an error in a union."""
+"""Parts that pydantic adds to the location of an error in a union."""
 
 
 class StrictModel(BaseModel):
-    """A model without unknown keys and without coercion between types; NaN and infinity only where a field allows them."""
+    """A model that forbids unknown keys and conversions between types, and NaN and infinity unless a field allows them."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
 def model_from_dataclasses(name: str, *declarations: type, leave_out: tuple[str, ...] = ()) -> Any:
-    """Make a strict model with the fields, defaults and bounds that dataclasses declare.
+    """Make a strict model with the fields, defaults and bounds of dataclasses.
+
+    Numbers have to be at least 0 unless their field has bounds of its own.
 
     Args:
-        name: of the model.
-        declarations: dataclasses; the metadata of a field may hold ``gt``, ``ge``, ``lt``, ``le`` or ``choices``.
-        leave_out: fields that files do not set.
+        name: name of the model.
+        declarations: dataclasses. The metadata of a field may hold bounds (``gt``, ``ge``, ``lt``, ``le``), the allowed
+            values (``choices``), or the bounds of the integers in a tuple of any length (``items``).
+        leave_out: fields that files may not set.
     """
     fields = {
         field.name: _field(field)
@@ -44,7 +47,7 @@ def model_from_dataclasses(name: str, *declarations: type, leave_out: tuple[str,
 
 
 def _field(field: dataclasses.Field) -> Any:
-    """Type, bounds and default of one setting."""
+    """Return the type, with its bounds, and the default of one setting, as pydantic declares a field."""
     default, bounds = field.default, {k: v for k, v in field.metadata.items() if k in _BOUNDS}
     if "choices" in field.metadata:
         return Literal[field.metadata["choices"]], default
@@ -60,57 +63,60 @@ def _field(field: dataclasses.Field) -> Any:
     return Range, default
 
 
-def suggest(word: str, known: Iterable[str]) -> str:
-    """Suggest the nearest of the known words, or list them all."""
-    close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.4)
-    return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known)}"
+def suggest(word: str, options: Iterable[str]) -> str:
+    """Return a hint for an unknown word: the most similar option, or all options if none is similar."""
+    options = list(options)
+    close = difflib.get_close_matches(word, options, n=1, cutoff=0.4)
+    return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(options)}"
 
 
 def expectation(error: Any) -> str:
-    """Say what would be right, from one of pydantic's errors."""
+    """Return what one of pydantic's errors says that the value should be."""
     message: str = error["msg"]
     return message.replace("Input should be", "it should be").replace("Value error, ", "")
 
 
-def describe_error(source: str, error: pydantic.ValidationError, root: type[BaseModel], data: Any = None) -> str:
-    """Describe the first error in one line: file, field, value, and what would be right.
+def describe_error(source: str, error: pydantic.ValidationError, model: type[BaseModel], data: Any = None) -> str:
+    """Describe the first of pydantic's errors in one line: source, field, value, and what would be right.
 
     Args:
-        source: the file or option.
-        error: pydantic's.
-        root: the model that was validated.
-        data: what was validated; names the entry of a list of tables that is at fault.
+        source: the file or option that the data come from.
+        error: raised by the validation.
+        model: the model that was validated.
+        data: the data; if they are given, an error in a list of tables names the table.
     """
     first = error.errors()[0]
     if first["type"] == "value_error":
         return f"{source}: {expectation(first)}"
-    entry, path = _split_location([part for part in first["loc"] if part not in _TYPE_TAGS], data)
-    place = ".".join(map(str, path))
+    location = [part for part in first["loc"] if part not in _TYPE_TAGS]
+    table, path = _split_location(location, model, data)
+    subject = f"{source}: {table}{'.'.join(map(str, path))}".rstrip()
     if first["type"] == "extra_forbidden":
-        known = _fields_at(root, first["loc"][:-1])
-        hint = suggest(str(first["loc"][-1]), known)
-        everything = "" if known == root.model_fields or hint.startswith("known") else f" known: {', '.join(known)}"
-        return f"{source}: {entry}{place} is not a setting; {hint}{everything}"
+        fields = _fields_at(model, first["loc"][:-1])
+        hint = suggest(str(first["loc"][-1]), fields)
+        options = "" if fields == model.model_fields or hint.startswith("known") else f" known: {', '.join(fields)}"
+        return f"{subject} is not a setting; {hint}{options}"
     if first["type"] == "missing":
-        return f"{source}: {entry}{place} is missing"
-    return f"{source}: {entry}{place} is {first['input']!r}; {expectation(first)}"
+        return f"{subject} is missing"
+    return f"{subject} is {first['input']!r}; {expectation(first)}"
 
 
-def _split_location(location: list[Any], data: Any) -> tuple[str, list[Any]]:
-    """Split a location into the entry of a list of tables, counted from 1 and named, and the rest of the way."""
-    if not isinstance(data, dict) or len(location) < 2 or not isinstance(location[1], int):
+def _split_location(location: list[Any], model: type[BaseModel], data: Any) -> tuple[str, list[Any]]:
+    """Split a location into a table of a list, counted from 1 and named, and the path inside it."""
+    in_list = len(location) > 1 and isinstance(location[1], int) and bool(_fields_at(model, location[:1]))
+    if not in_list or not isinstance(data, dict):
         return "", location
-    entry = data[location[0]][location[1]]
-    name = entry.get("name", "no name") if isinstance(entry, dict) else entry
+    table = data[location[0]][location[1]]
+    name = table.get("name", "no name") if isinstance(table, dict) else table
     return f"{location[0]} {location[1] + 1} ({name}): ", location[2:]
 
 
-def _fields_at(root: type[BaseModel], location: tuple[Any, ...]) -> dict[str, Any]:
-    """The fields of the model at a location."""
-    model: Any = root
+def _fields_at(model: Any, location: Sequence[Any]) -> dict[str, Any]:
+    """Return the fields of the model at a location inside ``model``; empty if there is no model."""
     for part in location:
         fields = getattr(model, "model_fields", None)
         if fields is not None:
             model = fields[part].annotation if part in fields else None
-        model = next((one for one in get_args(model) if hasattr(one, "model_fields")), model)  # X | None, tuple[X, ...]
+        arguments = get_args(model)  # of X | None or tuple[X, ...]
+        model = next((argument for argument in arguments if hasattr(argument, "model_fields")), model)
     return dict(getattr(model, "model_fields", {}))

@@ -1,4 +1,4 @@
-"""Files that are written atomic or not at all, text and TOML, and arrays that are read without pickle."""
+"""Atomic writes: a file is replaced by a complete new one, or left as it was."""
 
 import os
 from collections.abc import Callable, Iterator, Mapping
@@ -10,12 +10,12 @@ import numpy as np
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file atomic or not at all."""
+    """Write a text file in UTF-8, atomically."""
     _write(path, lambda file: file.write(text.encode()))
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], *, compressed: bool = True) -> None:
-    """Write named arrays as an ``.npz``, atomic or not at all."""
+    """Write named arrays as an ``.npz``, atomically."""
     named: dict[str, Any] = dict(arrays)
     save = np.savez_compressed if compressed else np.savez
     _write(path, lambda file: save(file, **named))
@@ -30,7 +30,10 @@ def _write(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:
 
 @contextmanager
 def atomic(path: Path) -> Iterator[Path]:
-    """A file to fill that takes the place of ``path`` if all goes well, and is gone if not; it has the same ending."""
+    """Yield a temporary path beside ``path``, with the same suffix, for the caller to write.
+
+    On success the temporary file replaces ``path``. After an exception it is removed, and ``path`` is as before.
+    """
     partial = path.with_name(f".{path.stem}.part{path.suffix}")
     try:
         yield partial
