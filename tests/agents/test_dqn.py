@@ -1,17 +1,17 @@
-"""The DQN: schedules, one update against NumPy, and what an agent may not do."""
+"""DQN: schedules, one update against NumPy, divergence, variants, and one trace for any population."""
 
 import functools
 import itertools
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from tests.populations import make_agent, stack
+from tests.populations import differs, make_agent, over_agents, stack, take
 from uavmec_jax.agents import dqn
-from uavmec_jax.agents.algorithm import AGENTS_AXIS
 from uavmec_jax.agents.dqn import DQNHyper, DQNSpec
 from uavmec_jax.agents.replay import Transition
 
@@ -22,15 +22,14 @@ HYPER = DQNHyper()
 @functools.cache
 def programs(spec):
     """Jitted ``init`` and ``update`` of a population, compiled once for each number of agents."""
-    over = lambda f, *axes: jax.jit(jax.vmap(f, axes, axis_name=AGENTS_AXIS))  # noqa: E731
-    return over(functools.partial(dqn.init, spec), 0), over(functools.partial(dqn.update, spec), 0, 0, None, None)
+    init, update = (functools.partial(function, spec) for function in (dqn.init, dqn.update))
+    return over_agents(init, 0), over_agents(update, 0, 0, None, None)
 
 
 def train(spec, agents, *bounds, state=None):
-    """A population of up to four agents through the iterations between the given bounds."""
+    """Train up to four agents, in chunks of iterations between the given bounds."""
     init, update = programs(spec)
-    places = np.arange(4) % agents.key.shape[0]
-    padded = jax.tree.map(lambda leaf: leaf[places], agents)
+    padded = take(agents, np.arange(4) % agents.key.shape[0])
     state = init(padded) if state is None else state
     for first, last in itertools.pairwise(bounds):
         state = update(padded, state, first, last)
@@ -64,27 +63,26 @@ def test_first_gradient_step_falls_at_step_104():
     agents = stack([make_agent(0)])
     before = train(SPEC, agents, 0, 25)  # 100 steps
     fresh = train(SPEC, agents, 0, 0)
-    jax.tree.map(assert_array_equal, before.weights, fresh.weights)
+    chex.assert_trees_all_equal(before.weights, fresh.weights)
     after = train(SPEC, agents, 25, 26, state=before)
-    moved = [(a != b).any() for a, b in zip(*map(jax.tree.leaves, (before.weights, after.weights)), strict=True)]
-    assert all(moved)
+    assert all(differs(before.weights, after.weights))
 
 
 @pytest.mark.slow
 def test_target_is_copied_before_the_gradient_step():
     agents = stack([make_agent(0, target_interval=200)])
     at_196 = train(SPEC, agents, 0, 49)
-    jax.tree.map(assert_array_equal, at_196.target, train(SPEC, agents, 0, 0).weights)
+    chex.assert_trees_all_equal(at_196.target, train(SPEC, agents, 0, 0).weights)
     at_200 = train(SPEC, agents, 49, 50, state=at_196)
-    jax.tree.map(assert_array_equal, at_200.target, at_196.weights)
-    assert any((a != b).any() for a, b in zip(*map(jax.tree.leaves, (at_200.target, at_200.weights)), strict=True))
+    chex.assert_trees_all_equal(at_200.target, at_196.weights)
+    assert any(differs(at_200.target, at_200.weights))
 
 
 @pytest.mark.slow
 def test_warm_up_explores_uniformly():
     agents = stack([make_agent(0, learning_starts=20_000, exploration_initial_eps=0.0, exploration_final_eps=0.0)])
     state = train(SPEC, agents, 0, 5_000)
-    actions = np.asarray(state.rows[0, 1:, -1]) & 255
+    actions = np.asarray(state.buffer_state[0, 1:, -1]) & 255
     counts = np.bincount(actions, minlength=12)
     assert counts.min() > 1400  # 20,000 / 12 = 1,667, standard deviation 39
 
@@ -106,7 +104,9 @@ def random_batch(hyper, seed=0):
 def numpy_update(weights, target, batch, hyper):
     """One DQN update in NumPy, float64: forward, Huber, backward, clip, Adam's first step."""
     layers = [{k: np.asarray(v, float) for k, v in weights["params"][f"TorchDense_{i}"].items()} for i in range(3)]
-    olds = [{k: np.asarray(v, float) for k, v in target["params"][f"TorchDense_{i}"].items()} for i in range(3)]
+    target_layers = [
+        {k: np.asarray(v, float) for k, v in target["params"][f"TorchDense_{i}"].items()} for i in range(3)
+    ]
 
     def forward(net, x):
         inputs = []
@@ -116,14 +116,14 @@ def numpy_update(weights, target, batch, hyper):
             x = np.maximum(x, 0) if i < 2 else x
         return x, inputs
 
-    best = forward(olds, np.asarray(batch.next_observation, float))[0].max(axis=1)
-    goal = np.asarray(batch.reward, float) + (1 - np.asarray(batch.terminated)) * hyper.gamma * best
+    next_value = forward(target_layers, np.asarray(batch.next_observation, float))[0].max(axis=1)
+    td_target = np.asarray(batch.reward, float) + (1 - np.asarray(batch.terminated)) * hyper.gamma * next_value
     q, inputs = forward(layers, np.asarray(batch.observation, float))
-    rows = np.arange(len(goal))
-    error = q[rows, batch.action] - goal
+    rows = np.arange(len(td_target))
+    error = q[rows, batch.action] - td_target
     loss = np.where(np.abs(error) < 1, 0.5 * error**2, np.abs(error) - 0.5).mean()
     delta = np.zeros_like(q)
-    delta[rows, batch.action] = np.clip(error, -1, 1) / len(goal)
+    delta[rows, batch.action] = np.clip(error, -1, 1) / len(td_target)
     gradients = []
     for i in (2, 1, 0):
         gradients.insert(0, {"kernel": inputs[i].T @ delta, "bias": delta.sum(axis=0)})
@@ -140,13 +140,14 @@ def numpy_update(weights, target, batch, hyper):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("max_grad_norm", [10.0, 0.01])
-def test_update_against_numpy(max_grad_norm):
+def test_update_against_numpy(jit, max_grad_norm):
     spec, hyper = DQNSpec(), DQNHyper(max_grad_norm=max_grad_norm, learning_starts=0)
     batch = random_batch(hyper)
     agent = make_agent(0)
     state = dqn.init(spec, agent)
     target = jax.tree.map(lambda leaf: leaf * 1.1, state.weights)
-    after = dqn._learn(spec, hyper, state.replace(target=target), batch, jnp.int32(4))
+    gradient_step = jit(functools.partial(dqn._gradient_step, spec, hyper))
+    after = gradient_step(state.replace(target=target), batch, jnp.int32(4))
     loss, layers = numpy_update(state.weights, target, batch, hyper)
     assert_allclose(after.loss, loss, rtol=1e-5)
     for i, layer in enumerate(layers):
@@ -158,7 +159,7 @@ def test_update_against_numpy(max_grad_norm):
 def test_same_seed_is_bit_equal_and_seeds_differ():
     agents = stack([make_agent(0), make_agent(0), make_agent(1)])
     state, again = train(SPEC, agents, 0, 300), train(SPEC, agents, 0, 300)
-    jax.tree.map(assert_array_equal, state, again)
+    chex.assert_trees_all_equal(state, again)
     kernel = state.weights["params"]["TorchDense_1"]["kernel"]
     assert_array_equal(kernel[0], kernel[1])
     assert (kernel[0] != kernel[2]).any()
@@ -167,8 +168,7 @@ def test_same_seed_is_bit_equal_and_seeds_differ():
 def test_chunks_do_not_matter():
     agents = stack([make_agent(0), make_agent(1)])
     whole, pieces = train(SPEC, agents, 0, 400), train(SPEC, agents, 0, 7, 150, 400)
-    jax.tree.map(assert_array_equal, whole.weights, pieces.weights)
-    assert_array_equal(whole.rows, pieces.rows)
+    chex.assert_trees_all_equal((whole.weights, whole.buffer_state), (pieces.weights, pieces.buffer_state))
 
 
 @pytest.mark.slow
@@ -181,9 +181,8 @@ def test_batched_agent_is_the_agent_alone():
         init, update = programs(SPEC)  # train() would pad
         population = stack([agent])
         alone = update(population, init(population), 0, 250)
-        assert_array_equal(alone.rows[0, :, -1], together.rows[i, :, -1])  # the same actions and ends
-        for a, b in zip(*map(jax.tree.leaves, (alone.weights, together.weights)), strict=True):
-            assert_allclose(a[0], b[i], rtol=1e-3, atol=1e-4)
+        assert_array_equal(alone.buffer_state[0, :, -1], together.buffer_state[i, :, -1])  # the same actions and ends
+        chex.assert_trees_all_close(take(alone.weights, 0), take(together.weights, i), rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -196,17 +195,17 @@ def test_batched_agent_is_the_agent_alone():
         ({"learning_rate": 1e35}, 104),
     ],
 )
-def test_diverged_agent_is_frozen_marked_and_touches_nobody(bad, step):
-    sound = [make_agent(0), make_agent(1), make_agent(2)]
-    state = train(SPEC, stack([sound[0], make_agent(1, **bad), sound[2]]), 0, 200)
-    without = train(SPEC, stack(sound), 0, 200)
+def test_diverged_agent_is_frozen_and_does_not_affect_the_others(bad, step):
+    stable = [make_agent(0), make_agent(1), make_agent(2)]
+    state = train(SPEC, stack([stable[0], make_agent(1, **bad), stable[2]]), 0, 200)
+    without = train(SPEC, stack(stable), 0, 200)
     assert_array_equal(state.diverged_at[:3], [-1, step, -1])
-    for leaf, other in zip(*map(jax.tree.leaves, (state.weights, without.weights)), strict=True):
-        assert np.isfinite(leaf).all()
-        assert_array_equal(leaf[jnp.array([0, 2])], other[jnp.array([0, 2])])
+    chex.assert_tree_all_finite(state.weights)
+    for i in (0, 2):
+        chex.assert_trees_all_equal(take(state.weights, i), take(without.weights, i))
     if step == 104:  # not one update was made
-        fresh = train(SPEC, stack(sound), 0, 0)
-        jax.tree.map(lambda a, b: assert_array_equal(a[1], b[1]), state.weights, fresh.weights)
+        fresh = train(SPEC, stack(stable), 0, 0)
+        chex.assert_trees_all_equal(take(state.weights, 1), take(fresh.weights, 1))
 
 
 def test_loss_that_overflows_freezes_later():
@@ -214,7 +213,7 @@ def test_loss_that_overflows_freezes_later():
     state = train(SPEC, stack([make_agent(0, learning_rate=1e25), make_agent(1)]), 0, 200)
     assert state.diverged_at[0] > 104
     assert state.diverged_at[1] == -1
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.weights))
+    chex.assert_tree_all_finite(state.weights)
 
 
 def test_frozen_agent_stays_as_it_was():
@@ -222,23 +221,23 @@ def test_frozen_agent_stays_as_it_was():
     early = train(SPEC, agents, 0, 30)
     late = train(SPEC, agents, 30, 100, state=early)
     assert early.diverged_at[0] == late.diverged_at[0] == 104
-    jax.tree.map(assert_array_equal, early.weights, late.weights)
+    chex.assert_trees_all_equal(early.weights, late.weights)
 
 
 def huber(error):
     return np.where(np.abs(error) < 1, 0.5 * error**2, np.abs(error) - 0.5)
 
 
-def test_double_lets_the_online_network_choose():
+def test_double_lets_the_online_network_select_the_next_action():
     plain, double = DQNSpec(), DQNSpec(double=True)
     weights, target = (dqn.init(plain, make_agent(seed)).weights for seed in (0, 1))
     batch = random_batch(HYPER)
-    online, later = (np.asarray(dqn.q_values(plain, HYPER, w, batch.next_observation)) for w in (weights, target))
+    online, delayed = (np.asarray(dqn.q_values(plain, HYPER, w, batch.next_observation)) for w in (weights, target))
     value = np.asarray(dqn.q_values(plain, HYPER, weights, batch.observation))[np.arange(16), batch.action]
-    for spec, best in ((plain, later.max(axis=1)), (double, later[np.arange(16), online.argmax(axis=1)])):
-        goal = np.asarray(batch.reward) + (1 - np.asarray(batch.terminated)) * 0.98 * best
-        assert_allclose(dqn.td_loss(spec, HYPER, weights, target, batch), huber(value - goal).mean(), rtol=1e-5)
-    assert (online.argmax(axis=1) != later.argmax(axis=1)).any()
+    for spec, next_value in ((plain, delayed.max(axis=1)), (double, delayed[np.arange(16), online.argmax(axis=1)])):
+        td_target = np.asarray(batch.reward) + (1 - np.asarray(batch.terminated)) * 0.98 * next_value
+        assert_allclose(dqn.td_loss(spec, HYPER, weights, target, batch), huber(value - td_target).mean(), rtol=1e-5)
+    assert (online.argmax(axis=1) != delayed.argmax(axis=1)).any()
 
 
 def test_dueling_values_have_advantages_of_mean_zero():
@@ -260,8 +259,8 @@ def test_soft_update_of_the_target():
     leaf = lambda tree: np.asarray(tree["params"]["TorchDense_1"]["kernel"])  # noqa: E731
     mixed = dqn.update_target(jnp.asarray(True), 0.25, weights, target)
     assert_allclose(leaf(mixed), 0.25 * leaf(weights) + 0.75 * leaf(target), rtol=1e-6)
-    jax.tree.map(assert_array_equal, dqn.update_target(jnp.asarray(True), 1.0, weights, target), weights)
-    jax.tree.map(assert_array_equal, dqn.update_target(jnp.asarray(False), 0.25, weights, target), target)
+    chex.assert_trees_all_equal(dqn.update_target(jnp.asarray(True), 1.0, weights, target), weights)
+    chex.assert_trees_all_equal(dqn.update_target(jnp.asarray(False), 0.25, weights, target), target)
 
 
 @pytest.mark.slow
@@ -269,6 +268,5 @@ def test_all_variants_together_train():
     spec = DQNSpec(total_steps=4_000, double=True, dueling=True, n_step=3, replay_capacity=1_000)
     state = train(spec, stack([make_agent(0, tau=0.01, target_interval=4), make_agent(1)]), 0, 1_000)
     assert (state.diverged_at[:2] == -1).all()
-    moved = [(a != b).any() for a, b in zip(*map(jax.tree.leaves, (state.target, state.weights)), strict=True)]
-    assert all(moved)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.weights))
+    assert all(differs(state.target, state.weights))
+    chex.assert_tree_all_finite(state.weights)

@@ -1,22 +1,22 @@
-"""Our learners against Stable-Baselines3, from golden files that experiments/parity_sb3.py made with the library itself."""
+"""The algorithms against Stable-Baselines3, from golden files that experiments/parity_sb3.py made with the library itself."""
 
 import functools
 import json
 from pathlib import Path
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 from scipy import stats
 
-from tests.populations import make_agent, stack
-from uavmec_jax.agents import a2c, dqn, on_policy, ppo
-from uavmec_jax.agents import gae as estimates
-from uavmec_jax.agents.algorithm import AGENTS_AXIS
+from tests.populations import differs, make_agent, over_agents, stack
+from uavmec_jax.agents import a2c, actor_critic, dqn, gae, ppo
 from uavmec_jax.agents.collect_rollout import Samples
-from uavmec_jax.agents.optimizers import TrainState, clipped_adam, clipped_rmsprop, global_norm
+from uavmec_jax.agents.optimizers import TrainState, clipped_adam, clipped_rmsprop
 from uavmec_jax.agents.replay import Transition
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "sb3"
@@ -30,12 +30,12 @@ def golden(name):
 
 
 def tree(arrays, prefix, layers):
-    """Torch's ``<layer>.weight`` and ``.bias`` under ``prefix`` as our weights; ``layers``: our path -> their layer."""
+    """Convert PyTorch's ``<layer>.weight`` and ``.bias`` under ``prefix``; ``layers`` maps our paths to their layers."""
     params: dict = {}
     for ours, theirs in layers.items():
         *parents, last = ours.split("/")
-        place = functools.reduce(lambda at, name: at.setdefault(name, {}), parents, params)
-        place[last] = {
+        parent = functools.reduce(lambda at, name: at.setdefault(name, {}), parents, params)
+        parent[last] = {
             "kernel": jnp.asarray(arrays[f"{prefix}/{theirs}.weight"].T),
             "bias": jnp.asarray(arrays[f"{prefix}/{theirs}.bias"]),
         }
@@ -54,14 +54,14 @@ ACTOR_CRITIC_LAYERS = {
 
 
 def assert_near(ours, theirs):
-    """Every tensor equal up to a relative difference (Euclidean norm) of 1e-5."""
-    assert jax.tree.structure(ours) == jax.tree.structure(theirs)
-    for mine, their in zip(*map(jax.tree.leaves, (ours, theirs)), strict=True):
-        assert np.linalg.norm(mine - their) <= CLOSE * max(np.linalg.norm(their), 1e-3)
+    """Assert that every tensor has a relative difference (Euclidean norm) of at most 1e-5."""
+    chex.assert_trees_all_equal_structs(ours, theirs)
+    for our, their in zip(*map(jax.tree.leaves, (ours, theirs)), strict=True):
+        assert np.linalg.norm(our - their) <= CLOSE * max(np.linalg.norm(their), 1e-3)
 
 
 def clipped(gradient, max_norm):
-    factor = jnp.minimum(max_norm / (global_norm(gradient) + 1e-6), 1.0)
+    factor = jnp.minimum(max_norm / (optax.tree.norm(gradient) + 1e-6), 1.0)
     return jax.tree.map(lambda g: g * factor, gradient)
 
 
@@ -69,9 +69,9 @@ def test_dqn_updates():
     theirs, spec, hyper = golden("dqn"), dqn.DQNSpec(), dqn.DQNHyper()
     weights, target = tree(theirs, "weights_0", DQN_LAYERS), tree(theirs, "target", DQN_LAYERS)
     state = dqn.init(spec, make_agent()).replace(weights=weights, target=target)
-    state = state.replace(opt_state=clipped_adam().init(weights), rows=None)
+    state = state.replace(opt_state=clipped_adam().init(weights), buffer_state=None)
     loss_of = jax.jit(jax.value_and_grad(lambda w, batch: dqn.td_loss(spec, hyper, w, target, batch)))
-    learn = jax.jit(lambda state, batch, step: dqn._learn(spec, hyper, state, batch, step))
+    gradient_step = jax.jit(functools.partial(dqn._gradient_step, spec, hyper))
     losses = []
     for k in range(10):
         column = lambda name, k=k: jnp.asarray(theirs[name][k, :, 0])  # noqa: E731
@@ -86,7 +86,7 @@ def test_dqn_updates():
         if k == 0:
             _, gradient = loss_of(state.weights, batch)
             assert_near(clipped(gradient, hyper.max_grad_norm), tree(theirs, "gradient", DQN_LAYERS))
-        state = learn(state, batch, 104 + 4 * k)
+        state = gradient_step(state, batch, 104 + 4 * k)
         losses.append(float(state.loss))
         if k == 0:
             assert_near(state.weights, tree(theirs, "weights_1", DQN_LAYERS))
@@ -94,12 +94,12 @@ def test_dqn_updates():
     assert_near(state.weights, tree(theirs, "weights_10", DQN_LAYERS))
 
 
-def samples(arrays, *place):
-    at = lambda name: jnp.asarray(arrays[name][place] if place else arrays[name])  # noqa: E731
+def samples(arrays, *index):
+    at = lambda name: jnp.asarray(arrays[name][index] if index else arrays[name])  # noqa: E731
     return Samples(
         observation=at("observations"),
         action=at("actions")[..., 0].astype(jnp.int32),
-        advantage=at("generalized_advantages"),
+        advantage=at("advantages"),
         returns=at("returns"),
         log_prob=at("log_probs"),
     )
@@ -119,8 +119,8 @@ def test_ppo_epoch():
     train_state = TrainState(weights, clipped_adam(eps=1e-5).init(weights), jnp.int32(-1))
     for minibatches in (1, 10, 32):
         spec = ppo.PPOSpec(n_steps=64 * minibatches)
-        learn = jax.jit(functools.partial(ppo.learn, spec, hyper))
-        after, loss = learn(train_state, rows[: 64 * minibatches], 1, 2048)
+        train_epoch = jax.jit(functools.partial(ppo.train_epoch, spec, hyper))
+        after, loss = train_epoch(train_state, rows[: 64 * minibatches], 1, 2048)
         assert_allclose(loss, theirs["losses"][minibatches - 1], rtol=CLOSE)
         assert_near(after.weights, tree(theirs, f"weights_{minibatches}", ACTOR_CRITIC_LAYERS))
 
@@ -132,10 +132,10 @@ def test_a2c_updates():
     loss_of = jax.jit(jax.value_and_grad(lambda w: a2c.a2c_loss(spec, hyper, w, samples(theirs, 0))))
     _, gradient = loss_of(weights)
     assert_near(clipped(gradient, hyper.max_grad_norm), tree(theirs, "gradient", ACTOR_CRITIC_LAYERS))
-    learn = jax.jit(functools.partial(a2c.learn, spec, hyper))
+    gradient_step = jax.jit(functools.partial(a2c.gradient_step, spec, hyper))
     losses = []
     for k in range(10):
-        train_state, loss = learn(train_state, samples(theirs, k), 5 * (k + 1))
+        train_state, loss = gradient_step(train_state, samples(theirs, k), 5 * (k + 1))
         losses.append(float(loss))
         if k == 0:
             assert_near(train_state.weights, tree(theirs, "weights_1", ACTOR_CRITIC_LAYERS))
@@ -143,25 +143,27 @@ def test_a2c_updates():
     assert_near(train_state.weights, tree(theirs, "weights_10", ACTOR_CRITIC_LAYERS))
 
 
-@pytest.mark.parametrize(("name", "gae_lambda", "place"), [("ppo", 0.95, ()), ("a2c", 1.0, (3,))])
-def test_values_log_probabilities_and_advantages(name, gae_lambda, place):
+@pytest.mark.parametrize(("name", "gae_lambda", "index"), [("ppo", 0.95, ()), ("a2c", 1.0, (3,))])
+def test_values_log_probabilities_and_advantages(jit, name, gae_lambda, index):
     theirs = golden(name)
-    rollout = samples(theirs, *place)
-    at = lambda key: theirs[key][place] if place else theirs[key]  # noqa: E731
-    if not place:  # the weights that played are those before the first update
+    rollout = samples(theirs, *index)
+    at = lambda key: theirs[key][index] if index else theirs[key]  # noqa: E731
+    if not index:  # the rollout was played with the weights before the first update
         weights, spec, hyper = tree(theirs, "weights_0", ACTOR_CRITIC_LAYERS), ppo.PPOSpec(), ppo.PPOHyper()
-        assert_allclose(on_policy.value(spec, hyper, weights, rollout.observation), at("values"), rtol=1e-4, atol=1e-5)
-        scores = on_policy.logits(spec, hyper, weights, rollout.observation)
-        assert_allclose(estimates.log_probability(scores, rollout.action)[0], at("log_probs"), rtol=1e-5)
-    # SB3 notes where an episode starts; it ended the slot before. The value after the last slot follows from its advantage.
+        logits, values = jit(functools.partial(actor_critic.logits_and_value, spec, hyper))(
+            weights, rollout.observation
+        )
+        assert_allclose(values, at("values"), rtol=1e-4, atol=1e-5)
+        assert_allclose(jit(gae.log_prob_and_entropy)(logits, rollout.action)[0], at("log_probs"), rtol=1e-5)
+    # SB3 stores where an episode starts; it ended the slot before. The value after the last slot follows from its advantage.
     ended = np.append(at("episode_starts")[1:], 0).astype(bool)
-    last_value = (at("generalized_advantages")[-1] - at("rewards")[-1] + at("values")[-1]) / 0.98
+    last_value = (at("advantages")[-1] - at("rewards")[-1] + at("values")[-1]) / 0.98
     columns = (jnp.asarray(at(key))[:, None] for key in ("rewards", "values"))
-    found = estimates.generalized_advantages(
+    advantages = jit(gae.generalized_advantages)(
         *columns, jnp.array([last_value]), jnp.asarray(ended)[:, None], 0.98, gae_lambda
     )
-    assert_allclose(found[:, 0], at("generalized_advantages"), rtol=1e-4, atol=1e-4)
-    assert_allclose(rollout.returns, at("generalized_advantages") + at("values"), rtol=1e-6)
+    assert_allclose(advantages[:, 0], at("advantages"), rtol=1e-4, atol=1e-4)
+    assert_allclose(rollout.returns, at("advantages") + at("values"), rtol=1e-6)
 
 
 def test_epsilon():
@@ -176,17 +178,17 @@ def test_epsilon():
 def test_initial_weights_come_from_the_same_distribution(name, layers):
     theirs = golden("initial")
     network = dqn.DQNSpec().network if name == "dqn" else ppo.PPOSpec().network
-    make = jax.jit(jax.vmap(lambda key: network.init(key, jnp.zeros((1, 24)))))
-    ours = make(jax.random.split(jax.random.key(0), 40))["params"]
+    init = jax.jit(jax.vmap(lambda key: network.init(key, jnp.zeros((1, 24)))))
+    weights = init(jax.random.split(jax.random.key(0), 40))["params"]
     for path, layer in layers.items():
-        made = functools.reduce(lambda at, part: at[part], path.split("/"), ours)
-        for leaf, kind in (("kernel", "weight"), ("bias", "bias")):
-            mine, their = np.ravel(made[leaf]), theirs[f"{name}/{layer}.{kind}"]
+        our_layer = functools.reduce(lambda at, part: at[part], path.split("/"), weights)
+        for leaf, tensor in (("kernel", "weight"), ("bias", "bias")):
+            our, their = np.ravel(our_layer[leaf]), theirs[f"{name}/{layer}.{tensor}"]
             if not their.any():
-                assert not mine.any()
+                assert not our.any()
                 continue
-            # Few thousand weights each: a gain off by 15 % would be seen.
-            assert stats.ks_2samp(mine, their).pvalue > 1e-3, layer
+            # With a few thousand weights each, a gain that is off by 15 % is detected.
+            assert stats.ks_2samp(our, their).pvalue > 1e-3, layer
 
 
 def test_their_environment_checker_passed_ours():
@@ -198,19 +200,15 @@ def test_order_of_target_copies_and_gradient_steps():
     facts = json.loads((GOLDEN / "versions.json").read_text())
     spec = dqn.DQNSpec(total_steps=10_008)
     agents = stack([make_agent(0)])
-    init, update = (
-        jax.jit(jax.vmap(functools.partial(function, spec), axes, axis_name=AGENTS_AXIS))
-        for function, axes in ((dqn.init, (0,)), (dqn.update, (0, 0, None, None)))
-    )
-    state, events = init(agents), []
-    moved = lambda a, b: any((x != y).any() for x, y in zip(*map(jax.tree.leaves, (a, b)), strict=True))  # noqa: E731
+    update = over_agents(functools.partial(dqn.update, spec), 0, 0, None, None)
+    state, events = over_agents(functools.partial(dqn.init, spec), 0)(agents), []
     for first, last in ((24, 28), (2498, 2502)):
         state = update(agents, state, 0 if first == 24 else 28, first)
         for i in range(first, last):
             before, state = state, update(agents, state, i, i + 1)
-            if moved(before.target, state.target):
+            if any(differs(before.target, state.target)):
                 events.append([4 * i + 4, "target copy"])
-                jax.tree.map(assert_array_equal, state.target, before.weights)  # copied before the gradient step
-            if moved(before.weights, state.weights):
+                chex.assert_trees_all_equal(state.target, before.weights)  # copied before the gradient step
+            if any(differs(before.weights, state.weights)):
                 events.append([4 * i + 4, "gradient step"])
     assert events == facts["order"]

@@ -1,4 +1,6 @@
-"""The replay memory against a plain list of transitions."""
+"""The replay buffer against a plain list of transitions."""
+
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -19,11 +21,11 @@ def test_size_of_a_row_and_of_the_paper_grid():
 
 
 def filled(spec, n, seed=0):
-    """Write ``n`` random transitions; returns the rows and the list of what went in (last: whether an episode ended)."""
+    """Write ``n`` random transitions; return the buffer and the list of them (last: whether an episode ended)."""
     rng = np.random.default_rng(seed)
     d = spec.n_devices
-    first = np.concatenate([np.ones(d), np.zeros(d)]).astype(np.float32)
-    rows, stored, observation = replay.init(spec), [], first
+    initial = np.concatenate([np.ones(d), np.zeros(d)]).astype(np.float32)
+    buffer_state, stored, observation = replay.init(spec), [], initial
     for start in range(0, n, spec.stride):
         new = []
         for _ in range(spec.stride):
@@ -38,11 +40,11 @@ def filled(spec, n, seed=0):
                     jnp.asarray(terminated), jnp.asarray(ended),
                 )
             )  # fmt: skip
-            reached = np.concatenate([battery, age.astype(np.float32)])
-            stored.append((observation, action, reward, float(terminated), reached, ended))
-            observation = first if ended else reached
-        rows = replay.add(spec, rows, jnp.int32(start), jnp.stack(new))
-    return rows, stored
+            next_observation = np.concatenate([battery, age.astype(np.float32)])
+            stored.append((observation, action, reward, float(terminated), next_observation, ended))
+            observation = initial if ended else next_observation
+        buffer_state = replay.add(spec, buffer_state, jnp.int32(start), jnp.stack(new))
+    return buffer_state, stored
 
 
 @pytest.mark.parametrize(
@@ -55,44 +57,46 @@ def filled(spec, n, seed=0):
         (64, 9, 5, 30, 60, True),
     ],
 )
-def test_every_transition_comes_back_to_the_bit(n_devices, capacity, stride, max_age, written, wraps):
+def test_every_transition_is_stored_exactly(jit, n_devices, capacity, stride, max_age, written, wraps):
     spec = ReplaySpec(n_devices, capacity, stride, max_age, wraps)
-    rows, stored = filled(spec, written)
+    buffer_state, stored = filled(spec, written)
     size = min(written, capacity)
-    batch = replay.sample(spec, rows, jnp.int32(written), jnp.arange(size, dtype=jnp.uint32), GAMMA)
-    for i in range(size):  # word i draws the transition i back from the newest
-        observation, action, reward, terminated, reached, _ = stored[-1 - i]
+    sample = jit(functools.partial(replay.sample, spec))
+    batch = sample(buffer_state, jnp.int32(written), jnp.arange(size, dtype=jnp.uint32), GAMMA)
+    for i in range(size):  # word i samples the transition i before the newest
+        observation, action, reward, terminated, next_observation, _ = stored[-1 - i]
         assert_array_equal(batch.observation[i], observation)
-        assert_array_equal(batch.next_observation[i], reached)
+        assert_array_equal(batch.next_observation[i], next_observation)
         assert (batch.action[i], batch.reward[i], batch.terminated[i]) == (action, reward, terminated)
     assert_array_equal(batch.discount, np.float32(GAMMA))
 
 
 def test_sampling_is_uniform_and_with_replacement():
     spec = ReplaySpec(n_devices=2, capacity=50, stride=1, wraps=True)
-    rows, _ = filled(spec, 70)
+    buffer_state, _ = filled(spec, 70)
     # the reward identifies the transition
     bits = jax.random.bits(jax.random.key(0), (20_000,))
-    rewards = np.asarray(replay.sample(spec, rows, jnp.int32(70), bits, GAMMA).reward)
+    rewards = np.asarray(replay.sample(spec, buffer_state, jnp.int32(70), bits, GAMMA).reward)
     values, counts = np.unique(rewards, return_counts=True)
     assert len(values) == 50
     assert stats.chisquare(counts).pvalue > 1e-3
-    few = np.asarray(replay.sample(spec, rows, jnp.int32(70), bits[:40], GAMMA).reward)
+    few = np.asarray(replay.sample(spec, buffer_state, jnp.int32(70), bits[:40], GAMMA).reward)
     assert len(np.unique(few)) < 40  # 40 of 50 without replacement would all differ
 
 
-def test_only_what_was_written_is_drawn():
+def test_only_written_transitions_are_sampled():
     spec = ReplaySpec(n_devices=2, capacity=1000, stride=1, wraps=False)
-    rows, stored = filled(spec, 5)
-    drawn = replay.sample(spec, rows, jnp.int32(5), jax.random.bits(jax.random.key(0), (500,)), GAMMA)
-    assert set(np.asarray(drawn.reward).tolist()) == {float(reward) for _, _, reward, *_ in stored}
+    buffer_state, stored = filled(spec, 5)
+    batch = replay.sample(spec, buffer_state, jnp.int32(5), jax.random.bits(jax.random.key(0), (500,)), GAMMA)
+    assert set(np.asarray(batch.reward).tolist()) == {float(reward) for _, _, reward, *_ in stored}
 
 
 @pytest.mark.parametrize(("capacity", "written", "wraps"), [(40, 40, False), (16, 100, True)])
-def test_n_step_returns(capacity, written, wraps):
+def test_n_step_returns(jit, capacity, written, wraps):
     spec = ReplaySpec(3, capacity, wraps=wraps, n_step=3)
-    rows, stored = filled(spec, written)
-    batch = replay.sample(spec, rows, jnp.int32(written), jnp.arange(capacity, dtype=jnp.uint32), GAMMA)
+    buffer_state, stored = filled(spec, written)
+    sample = jit(functools.partial(replay.sample, spec))
+    batch = sample(buffer_state, jnp.int32(written), jnp.arange(capacity, dtype=jnp.uint32), GAMMA)
     for i in range(capacity):
         summed, total = 0, 0.0
         for transition in stored[len(stored) - 1 - i :][:3]:  # up to the newest one

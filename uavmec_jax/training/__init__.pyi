@@ -2,5 +2,5 @@ from .host import use_all_cores as use_all_cores
 from .population import Progress as Progress
 from .sweep import TrainedPopulation as TrainedPopulation
 from .sweep import train as train
-from .training import TrainedShard as TrainedShard
+from .trained_shard import TrainedShard as TrainedShard
 from .training import Validation as Validation

@@ -1,4 +1,4 @@
-"""The machine a run happens on: its cores, memory and versions."""
+"""The machine that a run is on: its cores, memory and software versions."""
 
 import hashlib
 import importlib
@@ -16,39 +16,39 @@ import psutil
 from uavmec_jax.errors import StudyError
 
 MEMORY_SHARE = 0.8
-"""Share of the free memory that a run may plan with."""
+"""Share of the free memory that a run may use."""
 
 
 def use_all_cores(share: tuple[int, int] | None = None) -> None:
-    """Make every CPU core a device of its own; call before JAX is first used.
+    """Make every CPU core a JAX device. Call this before JAX is first used.
 
-    Agents are split over the devices, and each then works in its own core's cache: nearly twice as fast as one device
-    that spreads every small operation over the cores. Without effect once JAX has started, or if the user has already
-    set a number of devices.
+    Agents are split over the devices, so that each core works in its own cache. This is nearly twice as fast as a single
+    device that spreads every small operation over all cores. The call has no effect once JAX has started, or if the user
+    has already set a number of devices.
 
     Args:
-        share: ``(i, n)``: keep to the i-th of n equal parts of the cores (at least one), from 1.
+        share: ``(i, n)``: use only the i-th of n equal parts of the cores (at least one core), counted from 1.
     """
     if hasattr(os, "sched_getaffinity"):
-        mine = sorted(os.sched_getaffinity(0))
+        cores = sorted(os.sched_getaffinity(0))
         if share is not None:
-            part = max(len(mine) // share[1], 1)
-            first = (share[0] - 1) * part % len(mine)
-            mine = mine[first : first + part]
-            os.sched_setaffinity(0, mine)
-        cores = len(mine)
+            per_part = max(len(cores) // share[1], 1)
+            first = (share[0] - 1) * per_part % len(cores)
+            cores = cores[first : first + per_part]
+            os.sched_setaffinity(0, cores)
+        n_cores = len(cores)
     else:
-        cores = max((os.cpu_count() or 1) // (share[1] if share else 1), 1)
+        n_cores = max((os.cpu_count() or 1) // (share[1] if share else 1), 1)
     if "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
         return
     try:
-        jax.config.update("jax_num_cpu_devices", cores)
+        jax.config.update("jax_num_cpu_devices", n_cores)
     except RuntimeError:  # the backend is already running
         return
 
 
 def free_memory() -> int:
-    """Bytes a population may use on this host's devices together."""
+    """Return the number of bytes that a population may use on all local devices together."""
     devices = jax.local_devices()
     if devices[0].platform == "cpu":
         return int(MEMORY_SHARE * psutil.virtual_memory().available)
@@ -57,7 +57,7 @@ def free_memory() -> int:
 
 
 def processor() -> str:
-    """Name of the processor, as well as the system tells it."""
+    """Return the name of the processor; where the system does not tell it, its architecture."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8") as lines:
             for line in lines:
@@ -69,14 +69,14 @@ def processor() -> str:
 
 
 def versions() -> dict[str, str]:
-    """Of what decides over the bits of a run."""
+    """Return the versions of the packages on which the numbers of a run depend."""
     packages = ("uavmec-jax", "jax", "jaxlib", "flax", "optax", "numpy", "scipy", "pandas")
     return {name: version(name) for name in packages}
 
 
 @cache
 def code_digest() -> str:
-    """SHA-256 of this package's source files."""
+    """Return the SHA-256 of this package's source files."""
     digest = hashlib.sha256()
     root = Path(__file__).parents[1]
     for file in sorted(root.rglob("*.py")):
@@ -85,7 +85,7 @@ def code_digest() -> str:
 
 
 def describe() -> dict[str, Any]:
-    """Versions and hardware, for ``run.json`` and ``uavmec doctor``."""
+    """Return versions and hardware as plain data, for ``run.json`` and ``uavmec doctor``."""
     return {
         "python": sys.version.split()[0],
         "platform": platform.platform(),
@@ -100,7 +100,12 @@ def describe() -> dict[str, Any]:
 
 
 def optional(module: str, needed_by: str, extra: str) -> Any:
-    """A module of a package that only comes with an extra.
+    """Import and return a module of a package that is only installed with an extra.
+
+    Args:
+        module: name of the module.
+        needed_by: the command or option that needs it, for the message.
+        extra: the extra of this package that installs it.
 
     Raises:
         StudyError: it is not installed.
@@ -114,7 +119,7 @@ def optional(module: str, needed_by: str, extra: str) -> Any:
 
 
 def version(name: str) -> str:
-    """Of an installed package, or that it is not installed."""
+    """Return the version of a package, or ``not installed``."""
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:

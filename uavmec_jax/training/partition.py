@@ -1,8 +1,8 @@
-"""How a population is cut into shards, and a shard into the groups of agents that one program trains.
+"""The partition of a population into shards, and of a shard into the groups of agents that one program trains.
 
-A shard is small enough for the machine: for its memory (the replay is what costs) and, on a CPU, for its caches. Its groups
-are spread over the local devices. The last bits of a training depend on the size of a group, so it is part of a run's plan;
-they do not depend on the number of devices that train the groups.
+A shard is small enough for the machine: for its memory (the replay buffers are the largest part) and, on a CPU, for its
+caches. Its groups are distributed over the local devices. The bits of a training depend on the size of a group, which is
+therefore part of a run's plan; they do not depend on the number of devices.
 """
 
 from dataclasses import dataclass
@@ -10,24 +10,24 @@ from dataclasses import dataclass
 import jax
 
 AGENTS_PER_CORE = 40
-"""Largest group on a CPU core: beyond it, weights and Adam's moments leave the core's cache."""
+"""Most agents in a group on a CPU core; with more, weights and Adam's moments no longer fit in the core's cache."""
 
 AGENTS_PER_ACCELERATOR = 8192
-"""Largest group on an accelerator; memory is usually the tighter limit."""
+"""Most agents in a group on an accelerator; memory is usually the tighter limit."""
 
 
 class PopulationTooLargeError(ValueError):
-    """Not even the smallest shard of the population fits in memory."""
+    """Not even a shard of one agent fits in memory."""
 
 
 @dataclass(frozen=True)
 class Partition:
-    """A population cut into equal shards.
+    """A partition of a population into shards of equal size.
 
     Attributes:
         shards: number of shards.
-        shard_size: agents in each of them; the last one is padded.
-        groups: groups of equal size in a shard.
+        shard_size: number of agents in each shard; the last one is padded.
+        groups: number of groups in each shard, all of the same size.
         shard_bytes: memory of a shard in training.
     """
 
@@ -38,27 +38,27 @@ class Partition:
 
     @property
     def group_size(self) -> int:
-        """Agents in a group."""
+        """Number of agents in a group."""
         return self.shard_size // self.groups
 
     @property
     def devices(self) -> int:
-        """Local devices that share the groups of a shard: as many as can have equally many groups each."""
-        local = jax.local_device_count()
-        return max(n for n in range(1, min(self.groups, local) + 1) if self.groups % n == 0)
+        """Number of local devices that train a shard: the most that can have equally many groups each."""
+        most = min(self.groups, jax.local_device_count())
+        return max(n for n in range(1, most + 1) if self.groups % n == 0)
 
 
 def partition_population(
     n_agents: int, agent_bytes: int, memory_limit: int, *, groups: int | None = None, max_shard: int | None = None
 ) -> Partition:
-    """Cut ``n_agents`` into equal shards that fit into ``memory_limit`` bytes.
+    """Partition ``n_agents`` agents into shards of equal size, each of which fits into ``memory_limit`` bytes.
 
     Args:
         n_agents: size of the population.
         agent_bytes: memory of one agent in training.
-        memory_limit: for one shard.
-        groups: of a shard; by default one per local device.
-        max_shard: most agents in a shard, if that is less than what the devices' caches hold.
+        memory_limit: memory of one shard, bytes.
+        groups: number of groups in a shard; by default one per local device.
+        max_shard: most agents in a shard; by default what the devices' caches hold.
 
     Raises:
         PopulationTooLargeError: one agent does not fit.
@@ -74,5 +74,5 @@ def partition_population(
             "lower the steps or the replay capacity"
         )
     shards = -(-n_agents // most)
-    size = -(-n_agents // (shards * groups)) * groups
-    return Partition(shards=shards, shard_size=size, groups=groups, shard_bytes=size * agent_bytes)
+    shard_size = -(-n_agents // (shards * groups)) * groups
+    return Partition(shards=shards, shard_size=shard_size, groups=groups, shard_bytes=shard_size * agent_bytes)

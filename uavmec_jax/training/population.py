@@ -1,4 +1,4 @@
-"""Many agents in lockstep, shard after shard."""
+"""The training of a population: its agents run in lockstep, shard after shard."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -10,18 +10,19 @@ from jaxtyping import Array, Key
 
 from uavmec_jax.agents.algorithm import Agent, Algorithm
 from uavmec_jax.training.partition import Partition
-from uavmec_jax.training.training import TrainedShard, Trainer, Validation
+from uavmec_jax.training.trained_shard import TrainedShard
+from uavmec_jax.training.training import Trainer, Validation
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a population is, reported after every chunk.
+    """The progress of a population, reported after every chunk.
 
     Attributes:
-        shard: number of the shard in training.
-        steps: environment steps made by the whole population.
-        total_steps: of a whole training.
-        mean_episode_length: of the training episodes that ended in the chunk, slots.
+        shard: index of the shard in training.
+        steps: environment steps made by all agents of the population together.
+        total_steps: the same at the end of the training.
+        mean_episode_length: mean length of the training episodes that ended in the chunk, slots.
     """
 
     shard: int
@@ -31,10 +32,10 @@ class Progress:
 
 
 def take_padded(tree: Any, first: int, size: int) -> Any:
-    """Take leaves ``[size, ...]`` from ``first`` on; past the end the last entry is repeated, to keep the shape."""
+    """Return the entries ``first`` to ``first + size`` of every leaf; past the end, the last entry is repeated."""
     n = jax.tree.leaves(tree)[0].shape[0]
-    places = np.minimum(np.arange(first, first + size), n - 1)
-    return jax.tree.map(lambda leaf: leaf[places], tree)
+    indices = np.minimum(np.arange(first, first + size), n - 1)
+    return jax.tree.map(lambda leaf: leaf[indices], tree)
 
 
 def train_population(
@@ -46,13 +47,13 @@ def train_population(
     partition: Partition,
     on_progress: Callable[[Progress], None] = lambda _: None,
 ) -> Iterator[TrainedShard]:
-    """Train a population shard by shard, yielding each shard when it is finished.
+    """Train a population shard by shard and yield the result of each shard as soon as it is finished.
 
     Args:
-        algorithm: what trains.
+        algorithm: the learning algorithm.
         agents: the population, leaves ``[A, ...]``.
-        validation_keys: ``[A, validation.draws]`` volume draws for the validations.
-        validation: the validations during training.
+        validation_keys: draws of the task volumes for the validations, ``D = validation.draws`` for each agent.
+        validation: when and how to validate.
         partition: from :func:`uavmec_jax.training.partition.partition_population`.
         on_progress: called after every chunk.
     """
@@ -61,9 +62,9 @@ def train_population(
     trainer = Trainer.compile(algorithm, example_agents, example_keys, validation, partition)
     for shard in range(partition.shards):
         first = shard * size
-        members = min(size, n - first)
+        n_members = min(size, n - first)
         training = trainer.start(*take_padded((agents, validation_keys), first, size))
         for _ in training.run():
-            done = first * algorithm.total_steps + members * training.steps
-            on_progress(Progress(shard, done, n * algorithm.total_steps, training.mean_episode_length))
-        yield training.result(members)
+            steps = first * algorithm.total_steps + n_members * training.steps
+            on_progress(Progress(shard, steps, n * algorithm.total_steps, training.mean_episode_length))
+        yield training.result(n_members)

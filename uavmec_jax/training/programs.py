@@ -1,4 +1,4 @@
-"""The compiled programs of a population: the agent axis is split over the devices of a mesh, which do not communicate."""
+"""The compiled programs of a population. The agent axis is sharded over the devices of a mesh, which do not communicate."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Key
+from jaxtyping import Array, Float, Int, Key
 
-from uavmec_jax.agents.algorithm import AGENTS_AXIS, Agent, Algorithm
+from uavmec_jax.agents.algorithm import AGENTS_AXIS, Agent, Algorithm, AlgorithmState
+from uavmec_jax.agents.networks import Weights
 from uavmec_jax.env.generator import ScenarioDistribution
 from uavmec_jax.env.rollout import Policy, priced_lifetimes, returns, rollouts
 from uavmec_jax.env.scenario import Scenario
@@ -20,29 +21,37 @@ from uavmec_jax.env.scenario import Scenario
 
 @struct.dataclass
 class Best:
-    """The best weights so far: ``weights`` leaves ``[B, ...]``, their validation ``score`` and ``step`` ``[B]``."""
+    """The weights with the best validation score so far.
 
-    weights: Any
-    score: Any
-    step: Any
+    Attributes:
+        weights: parameters of the network.
+        score: their validation score.
+        step: environment step of that validation, int32.
+    """
+
+    weights: Weights
+    score: Float[Array, "*batch"]
+    step: Int[Array, "*batch"]
 
 
 def make_mesh(devices: int) -> Mesh:
-    """The first local devices as a mesh of one axis, the agents."""
+    """Return a mesh of the first local devices; its one axis is that of the agents."""
     return Mesh(np.array(jax.local_devices()[:devices]), (AGENTS_AXIS,))
 
 
 def put_on_mesh(mesh: Mesh, tree: Any) -> Any:
-    """Leaves ``[B, ...]`` split over the devices of a mesh."""
+    """Shard leaves ``[B, ...]`` over the devices of a mesh."""
     return jax.device_put(tree, NamedSharding(mesh, PartitionSpec(AGENTS_AXIS)))
 
 
 @dataclass(frozen=True)
 class Programs:
-    """The compiled programs of one shape, the agent axis split over the devices of a mesh.
+    """The compiled programs for a batch of ``B`` agents, sharded over the devices of a mesh.
 
-    ``init(agents) -> state``; ``update(agents, state, first, last) -> state``, whose state is donated;
-    ``validate(agents, keys, weights, best, step) -> (score [B], best)``, whose best is donated.
+    Attributes:
+        init: ``(agents) -> state``.
+        update: ``(agents, state, first, last) -> state``: runs the iterations ``first <= i < last``; donates ``state``.
+        validate: ``(agents, keys, weights, best, step) -> (score [B], best)``; donates ``best``.
     """
 
     init: Callable
@@ -51,13 +60,13 @@ class Programs:
 
     @classmethod
     def compile(cls, algorithm: Algorithm, mesh: Mesh, example: tuple[Agent, Key[Array, "B D"]]) -> "Programs":
-        """Compile for agents and validation draws like ``example``."""
+        """Compile the programs for the shapes of an example: agents and the keys of their validations."""
         split, shared = PartitionSpec(AGENTS_AXIS), PartitionSpec()
 
         def over_agents(function: Callable, n_split: int, n_shared: int = 0, **jit: Any) -> Any:
             batched = jax.vmap(function, (0,) * n_split + (None,) * n_shared, axis_name=AGENTS_AXIS)
             specs = (split,) * n_split + (shared,) * n_shared
-            # check_vma: the branch in `update` is decided per device, which the checker has no type for.
+            # check_vma: the branch in `update` is decided on each device, which the checker cannot express.
             mapped = jax.shard_map(batched, mesh=mesh, in_specs=specs, out_specs=split, check_vma=False)
             return jax.jit(mapped, **jit)
 
@@ -67,12 +76,9 @@ class Programs:
         init = over_agents(algorithm.init, 1)
         state = jax.tree.map(struct_of, jax.eval_shape(init, agents))
         batch = sharding.shard_shape((keys.shape[0],))[0] * mesh.size
-        number = jax.ShapeDtypeStruct((batch,), np.float32, sharding=sharding)
-        best = Best(
-            weights=state.weights, score=number, step=jax.ShapeDtypeStruct((batch,), np.int32, sharding=sharding)
-        )
-        options = _compiler_options()
-        update = over_agents(algorithm.update, 2, 2, donate_argnums=1, compiler_options=options)
+        vector: Any = partial(jax.ShapeDtypeStruct, (batch,), sharding=sharding)
+        best = Best(weights=state.weights, score=vector(np.float32), step=vector(np.int32))
+        update = over_agents(algorithm.update, 2, 2, donate_argnums=1, compiler_options=_compiler_options())
         validate = over_agents(partial(_validate, algorithm), 4, 1, donate_argnums=3)
         return cls(
             init=init.lower(agents).compile(),
@@ -82,12 +88,12 @@ class Programs:
 
 
 def _compiler_options() -> dict[str, bool]:
-    """One core per device: XLA's schedule for concurrent execution only costs memory traffic (7 % of the speed)."""
+    """Return options for one core per device, where XLA's schedule for concurrent execution costs 7 % of the speed."""
     return {"xla_cpu_enable_concurrency_optimized_scheduler": False} if jax.default_backend() == "cpu" else {}
 
 
-def initial_best(state: Any) -> Best:
-    """Before the first validate: the weights of a state, which any validate betters."""
+def initial_best(state: AlgorithmState) -> Best:
+    """Return the best weights before the first validation: those of ``state``, with a score that every other exceeds."""
     size, sharding = state.diverged_at.shape[0], state.diverged_at.sharding
     return Best(
         weights=jax.tree.map(jnp.copy, state.weights),
@@ -96,28 +102,28 @@ def initial_best(state: Any) -> Best:
     )
 
 
-def _validate(algorithm: Algorithm, agent: Agent, keys: Key[Array, " D"], weights: Any, best: Best, step: Any) -> Any:
-    """Validation score of the greedy policy of one agent, and the best so far (ties keep the earlier).
+def _validate(
+    algorithm: Algorithm, agent: Agent, keys: Key[Array, " D"], weights: Weights, best: Best, step: Int[Array, ""]
+) -> tuple[Float[Array, ""], Best]:
+    """Return the validation score of one agent's greedy policy, and the best weights so far; ties keep the earlier ones.
 
-    The draws are of task volumes; of agents that play many scenarios, of a scenario each besides.
+    Each key draws the task volumes of one episode and, from a distribution, its scenario.
     """
     score = _score(algorithm.policy(agent.hyper, weights), agent.scenario, keys)
-    better = score > best.score
-    kept = jax.tree.map(
-        lambda new, old: jnp.where(better, new, old), (weights, score, step), (best.weights, best.score, best.step)
-    )
-    return score, Best(*kept)
+    is_better = score > best.score
+    candidate = Best(weights=weights, score=score, step=step)
+    return score, jax.tree.map(lambda new, old: jnp.where(is_better, new, old), candidate, best)
 
 
-def _score(policy: Policy, plays: Scenario | ScenarioDistribution, keys: Key[Array, " D"]) -> Array:
-    """The mean lifetime; of agents that are paid for more, for traffic, what they earn.
+def _score(policy: Policy, scenario: Scenario | ScenarioDistribution, keys: Key[Array, " D"]) -> Float[Array, ""]:
+    """Return the mean lifetime in slots, or the mean return if the reward also counts traffic.
 
-    Where every draw is another scenario, lives are counted less the price of the first failure.
+    In scenarios drawn from a distribution, the price of the first failure is subtracted from each lifetime.
     """
-    if isinstance(plays, ScenarioDistribution):
-        return jnp.mean(priced_lifetimes(policy, plays, keys))
-    score = jnp.mean(rollouts(policy, plays.params, plays.layout, keys).length.astype(jnp.float32))
-    if plays.layout.traffic is not None:
-        paid = (plays.reward.traffic_bonus > 0) | (plays.reward.traffic_penalty > 0)
-        score = jnp.where(paid, jnp.mean(returns(policy, plays, keys)), score)
+    if isinstance(scenario, ScenarioDistribution):
+        return jnp.mean(priced_lifetimes(policy, scenario, keys))
+    score = jnp.mean(rollouts(policy, scenario.params, scenario.layout, keys).length.astype(jnp.float32))
+    if scenario.layout.traffic is not None:
+        counts_traffic = (scenario.reward.traffic_bonus > 0) | (scenario.reward.traffic_penalty > 0)
+        score = jnp.where(counts_traffic, jnp.mean(returns(policy, scenario, keys)), score)
     return score

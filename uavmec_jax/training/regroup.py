@@ -1,51 +1,48 @@
-"""Continue with some agents of a population in fewer shards of the same shape, without compiling anything anew."""
-
-from typing import Any
+"""Continue the training of some agents of a population in fewer shards of the same shape, without recompilation."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from uavmec_jax.training.programs import put_on_mesh
 from uavmec_jax.training.training import GroupBatch, Training
 
 
 def regroup(trainings: list[Training], members: np.ndarray) -> list[Training]:
-    """Move some agents of several shards that are equally far into fewer shards of the same shape.
-
-    The old trainings must not be used any more.
+    """Move some agents into fewer shards of the same shape. The given trainings must not be used afterwards.
 
     Args:
-        trainings: shards of one population, in its order.
-        members: places in the population, in the order that they are to have.
+        trainings: the shards of one population, in its order, after the same number of chunks.
+        members: indices in the population of the agents to keep, in their new order.
     """
     trainer = trainings[0].trainer
-    size, per_batch = trainer.partition.shard_size, trainer.partition.group_size * trainer.mesh.size
-    shards = -(-len(members) // size)
-    places = members[np.minimum(np.arange(shards * size), len(members) - 1)].reshape(shards, size)
+    size, batch_size = trainer.partition.shard_size, trainer.partition.group_size * trainer.mesh.size
+    n_shards = -(-len(members) // size)
+    padded = members[np.minimum(np.arange(n_shards * size), len(members) - 1)].reshape(n_shards, size)
 
-    def regrouped(*leaves: Any) -> list[Any]:
-        all_agents = jnp.concatenate([jax.device_put(leaf, jax.local_devices()[0]) for leaf in leaves])
-        return [all_agents[own[k : k + per_batch]] for own in places for k in range(0, size, per_batch)]
+    def select(*leaves: Array) -> list[Array]:
+        whole = jnp.concatenate([jax.device_put(leaf, jax.local_devices()[0]) for leaf in leaves])
+        return [whole[shard[k : k + batch_size]] for shard in padded for k in range(0, size, batch_size)]
 
-    batches = [
+    trees = [
         (batch.agents, batch.keys, batch.state, batch.best)
         for training in trainings
         for batch in training.group_batches
     ]
-    structure = jax.tree.structure(batches[0])
-    leaves = [regrouped(*parts) for parts in zip(*map(jax.tree.leaves, batches), strict=True)]
-    moved = [
-        GroupBatch(*put_on_mesh(trainer.mesh, jax.tree.unflatten(structure, parts)))
-        for parts in zip(*leaves, strict=True)
+    selected = [select(*leaves) for leaves in zip(*map(jax.tree.leaves, trees), strict=True)]
+    structure = jax.tree.structure(trees[0])
+    batches = [
+        GroupBatch(*put_on_mesh(trainer.mesh, jax.tree.unflatten(structure, leaves)))
+        for leaves in zip(*selected, strict=True)
     ]
-    per_shard = len(moved) // shards
-    made = []
-    for k, own in enumerate(places):
-        training = Training(trainer, moved[k * per_shard : (k + 1) * per_shard], trainings[0].chunks_done)
+    per_shard = len(batches) // n_shards
+    regrouped = []
+    for k, shard in enumerate(padded):
+        training = Training(trainer, batches[k * per_shard : (k + 1) * per_shard], trainings[0].chunks_done)
         for name in ("episode_slots", "episodes", "scores"):
             if getattr(trainings[0], name):
                 curves = np.concatenate([np.stack(getattr(old, name), 1) for old in trainings])
-                setattr(training, name, list(curves[own].T))
-        made.append(training)
-    return made
+                setattr(training, name, list(curves[shard].T))
+        regrouped.append(training)
+    return regrouped

@@ -1,4 +1,4 @@
-"""Training for sweep scripts: any scenarios, any hyperparameters, one program."""
+"""``um.train``: train agents on any scenarios and with any hyperparameters, as one program."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -21,15 +21,16 @@ from uavmec_jax.files.validation import suggest
 from uavmec_jax.training import host
 from uavmec_jax.training.partition import PopulationTooLargeError, partition_population
 from uavmec_jax.training.population import Progress, train_population
-from uavmec_jax.training.training import TrainedShard, Validation
+from uavmec_jax.training.trained_shard import TrainedShard
+from uavmec_jax.training.training import Validation
 
 
 @dataclass(frozen=True)
 class TrainedPopulation:
-    """A population that was trained.
+    """A trained population.
 
     Attributes:
-        algorithm: what trained it.
+        algorithm: the learning algorithm.
         hyper: the hyperparameters, leaves ``[A]``.
         result: weights and curves of all agents, leaves ``[A, ...]``.
     """
@@ -42,8 +43,8 @@ class TrainedPopulation:
         """Return the greedy policy of one agent: ``policy(params, layout, state, key=None) -> action``.
 
         Args:
-            agent: its place in the population.
-            which: ``best`` or ``last`` weights.
+            agent: its index in the population.
+            which: ``best`` for the weights with the best validation score, ``last`` for those after the last step.
         """
         hyper, weights = jax.tree.map(lambda leaf: leaf[agent], (self.hyper, getattr(self.result, which)))
         return self.algorithm.policy(hyper, weights)
@@ -51,15 +52,15 @@ class TrainedPopulation:
     def table(self) -> pd.DataFrame:
         """Return one row per agent: its hyperparameters, ``best_validation`` (slots), ``best_step``, ``diverged_at``."""
         hyper = {name: np.asarray(leaf) for name, leaf in vars(self.hyper).items()}
-        found = {
+        results = {
             "best_validation": self.result.best_score,
             "best_step": self.result.best_step,
             "diverged_at": self.result.diverged_at,
         }
-        return pd.DataFrame(hyper | found)
+        return pd.DataFrame(hyper | results)
 
     def curve_table(self) -> pd.DataFrame:
-        """Return tidy curves: ``agent``, ``steps``, ``validation`` (mean lifetime in slots) of every validation."""
+        """Return one row per agent and validation: ``agent``, ``steps``, ``validation`` (mean lifetime in slots)."""
         n, validations = self.result.validation.shape
         return pd.DataFrame(
             {
@@ -85,17 +86,17 @@ def train(
 
     Args:
         algorithm: ``dqn``, ``ppo`` or ``a2c``.
-        scenarios: leaves ``[A, ...]``, e.g. from ``jax.vmap(um.make_scenario)``; each may have its own layout,
+        scenarios: leaves ``[A, ...]``, e.g. from ``jax.vmap(um.make_scenario)``. Each scenario may have its own layout,
             parameters and reward.
-        key: of all randomness; agent ``i`` has the ``i``-th key split from it.
+        key: source of all randomness; agent ``i`` has the ``i``-th key split from it.
         steps: environment steps of one agent.
-        hyper: traced hyperparameters, each a number or ``[A]`` of them.
+        hyper: traced hyperparameters, each one number or an array ``[A]``.
         settings: static settings: ``hidden``, ``batch_size``, ...
-        validation: validations of the greedy policies, which choose the best weights.
+        validation: when and how to validate the greedy policies; the best score selects the best weights.
         on_progress: called after every chunk.
 
     Raises:
-        StudyError: no such algorithm, hyperparameter or setting; a length that does not fit; too little memory.
+        StudyError: an unknown algorithm, hyperparameter or setting, a wrong number of values, or too little memory.
         AssertionError: the scenarios are not a batch.
     """
     if algorithm not in ALGORITHMS:
@@ -105,22 +106,22 @@ def train(
     n, n_devices = scenarios.layout.capacity.shape
     max_age = int(np.max(scenarios.params.data_age_limit_slots)) + 1
     bound = _bind(registered, settings or {}, steps, n_devices, max_age)
-    stacked = _stack_hyper(algorithm, registered, hyper or {}, n)
+    batched_hyper = _batch_hyper(algorithm, registered, hyper or {}, n)
     training_key, validation_key = jax.random.split(key)
-    agents = Agent(key=jax.random.split(training_key, n), scenario=scenarios, hyper=stacked)
+    agents = Agent(key=jax.random.split(training_key, n), scenario=scenarios, hyper=batched_hyper)
     try:
         partition = partition_population(n, bound.agent_bytes, host.free_memory())
     except PopulationTooLargeError as error:
         raise StudyError(f"steps is {steps}: {error}") from None
     draws = jax.random.split(validation_key, (n, validation.draws))
     shards = train_population(bound, agents, draws, validation=validation, partition=partition, on_progress=on_progress)
-    return TrainedPopulation(bound, stacked, _concatenate(list(shards)))
+    return TrainedPopulation(bound, batched_hyper, _concatenate(list(shards)))
 
 
 def _bind(
     registered: RegisteredAlgorithm, settings: Mapping[str, Any], steps: int, n_devices: int, max_age: int
 ) -> Algorithm:
-    """The algorithm with its static settings."""
+    """Return the algorithm with its static settings bound; those not given have their defaults."""
     defaults = {name: getattr(registered.spec(), name) for name in registered.static}
     for name in settings:
         if name not in defaults:
@@ -131,8 +132,8 @@ def _bind(
         raise StudyError(f"settings: {error}") from None
 
 
-def _stack_hyper(algorithm: str, registered: RegisteredAlgorithm, hyper: Mapping[str, Any], n: int) -> Any:
-    """Every hyperparameter as ``[A]``."""
+def _batch_hyper(algorithm: str, registered: RegisteredAlgorithm, hyper: Mapping[str, Any], n: int) -> Any:
+    """Return the hyperparameters of ``n`` agents, leaves ``[A]``; those not given have their defaults."""
     for name in hyper:
         if name not in registered.traced:
             hint = suggest(name, registered.traced)
@@ -147,13 +148,13 @@ def _stack_hyper(algorithm: str, registered: RegisteredAlgorithm, hyper: Mapping
 
 
 def _concatenate(shards: list[TrainedShard]) -> TrainedShard:
-    """Shards one after the other; the steps of curves are shared by all, seconds add up."""
-    parts = [vars(shard) for shard in shards]
-    shared = {name: parts[0][name] for name in ("chunk_steps", "validation_steps")}
-    seconds = {name: sum(part["seconds"][name] for part in parts) for name in parts[0]["seconds"]}
+    """Concatenate the results of shards; all share the steps of the curves, and their seconds are added."""
+    fields = [vars(shard) for shard in shards]
+    shared = {name: fields[0][name] for name in ("chunk_steps", "validation_steps")}
+    seconds = {name: sum(shard.seconds[name] for shard in shards) for name in shards[0].seconds}
     concatenated = {
-        name: jax.tree.map(lambda *leaves: np.concatenate(leaves), *(part[name] for part in parts))
-        for name in parts[0]
+        name: jax.tree.map(lambda *leaves: np.concatenate(leaves), *(values[name] for values in fields))
+        for name in fields[0]
         if name not in {*shared, "seconds"}
     }
     return TrainedShard(**concatenated, **shared, seconds=seconds)
