@@ -123,7 +123,7 @@ def test_the_shipped_policy_takes_any_number_of_devices(generalist, n):
     assert int(jax.jit(generalist)(params, layout, state)) == int(action)
     states = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), state)
     assert_array_equal(generalist(params, layout, states), [action, action])
-    assert generalist.value_fn(params, layout, states).shape == (2,)
+    assert generalist.value(params, layout, states).shape == (2,)
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import sys
 import pytest
 from click.testing import CliRunner
 
+from tests.cli.test_advise import HARBOUR
 from tests.runs.processes import TINY
 from uavmec_jax.cli import main
 from uavmec_jax.runs.shared_run import prepare_run
@@ -76,6 +77,32 @@ def test_bad_input_is_one_line_and_exit_code_2(tmp_path, monkeypatch, arguments,
     assert done.stderr.startswith(line)
     assert done.stderr.count("\n") == 1
     assert [file.name for file in tmp_path.iterdir()] == ["mine.txt"]
+
+
+@pytest.mark.slow
+def test_a_tour_and_a_run_refuse_each_others_folders(planned, tmp_path):
+    tour = tmp_path / "tour"
+
+    def refused(*arguments):
+        done = CliRunner().invoke(main, [str(argument) for argument in arguments])
+        assert done.exit_code == 2, done.output
+        return done.stderr.removesuffix("\n")
+
+    plan = ["plan", str(HARBOUR), "--draws", "1", "--width", "8", "--out"]
+    done = CliRunner().invoke(main, [*plan, str(tour)])
+    assert done.exit_code == 0, done.output
+    assert {file.name for file in tour.iterdir()} == {"tour.json", "tour.png", "scenario.toml", "tour.geojson"}
+    for command in ("resume", "status"):
+        assert refused(command, tour) == (
+            f"uavmec: {tour}: holds no run that can be resumed (run_plan.json is missing); it holds a tour of "
+            "`uavmec plan` (tour.json)"
+        )
+    assert refused("show", tour) == f"uavmec: {tour}: holds no run; it holds a tour of `uavmec plan` (tour.json)"
+    taken = f"uavmec: {tour}: already holds a tour of `uavmec plan`; give another folder with --out"
+    assert refused("run", "table5", "--out", tour) == refused(*plan, tour) == taken
+    assert refused(*plan, planned) == (
+        f"uavmec: {planned}: already holds a run; resume it with `uavmec resume`, or give another folder with --out"
+    )
 
 
 @pytest.mark.parametrize(
