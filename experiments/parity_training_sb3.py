@@ -47,7 +47,7 @@ def sb3_worker(seeds: list[int], steps: int) -> None:
         model.learn(steps)
         state, length = start, np.zeros(DRAWS, int)
         for slot in range(64):
-            seen = np.asarray(jax.vmap(observe, (None, 0))(devices, state))
+            seen = np.asarray(jax.vmap(observe, (None, None, 0))(params, devices, state))
             after, outcome = step(state, model.predict(seen, deterministic=True)[0], volumes[:, slot])
             length = np.where(length > 0, length, np.where(np.asarray(outcome.cause) != Cause.NONE, slot + 1, 0))
             state = after

@@ -1,8 +1,8 @@
-"""What a user can mend, told in one line. Imports nothing, so that the command line can catch it without loading JAX."""
+"""User-facing errors, one line each. Imports nothing, so that the command line can catch them without loading JAX."""
 
 
 class UserError(ValueError):
-    """Something given is not usable; the message is one line that names it and says what would be right."""
+    """Some input is not usable; the message is one line that names it and says what would be right."""
 
 
 class StudyError(UserError):
@@ -10,16 +10,16 @@ class StudyError(UserError):
 
 
 class ScenarioError(UserError):
-    """An named_scenario of devices is not usable."""
+    """A scenario, its file or its devices are not usable."""
 
 
 class PolicyError(UserError):
-    """A saved policy, or what it is asked, is not usable."""
+    """A saved policy, or an observation given to it, is not usable."""
 
 
 class StateError(UserError):
-    """The state of a network does not fit its layout."""
+    """The present state of a network does not fit its scenario."""
 
 
 class TrafficError(UserError):
-    """A road network, a place, a device file or an evacuation is not usable, or SUMO is not there or failed."""
+    """A road network, a place, a device file or an evacuation is not usable, or SUMO is missing or failed."""

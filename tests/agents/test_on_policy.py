@@ -59,7 +59,8 @@ def test_a_rollout_plays_the_environment():
     play = jax.jit(jax.vmap(functools.partial(experience.play, spec), axis_name=AGENTS_AXIS))
     after, samples = take(play(*stack([(agent, state, jax.random.key(5))])), 0)
     observation = samples.observation.reshape(40, 3, 24)
-    fresh = observe(agent.scenario.layout, initial_state(agent.scenario.params, agent.scenario.layout))
+    params, layout = agent.scenario.params, agent.scenario.layout
+    fresh = observe(params, layout, initial_state(params, layout))
     starts = np.isclose(observation, fresh, atol=1e-6).all(axis=-1)  # XLA multiplies by the reciprocal capacity
     assert starts[0].all()
     assert starts[1:].sum() == after.episodes  # an episode that ended begins again in the next slot

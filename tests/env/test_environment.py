@@ -169,7 +169,7 @@ def test_invariants_of_random_play(case):
         assert_array_equal(state.battery[layout.has_power], layout.capacity[layout.has_power])
         assert_array_equal(state.age[layout.has_comms], 0)
         assert_array_equal(state.age[outcome.served], 0)
-        observation = observe(layout, state)
+        observation = observe(params, layout, state)
         assert (observation[:n] >= 0).all()
         assert (observation[:n] <= 1).all()
         if outcome.cause in (Cause.BATTERY, Cause.DATA_AGE):

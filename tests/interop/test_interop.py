@@ -1,5 +1,6 @@
-"""The environment as other libraries see it."""
+"""The environment through the interfaces of other libraries."""
 
+import chex
 import gymnasium
 import jax
 import jax.numpy as jnp
@@ -19,16 +20,16 @@ from uavmec_jax.interop.vector_env import UavMecVectorEnv
 
 @pytest.fixture(scope="module")
 def env():
-    made = gymnasium.make(ENV_ID, render_mode="rgb_array")
-    yield made
-    made.close()
+    gym_env = gymnasium.make(ENV_ID, render_mode="rgb_array")
+    yield gym_env
+    gym_env.close()
 
 
-def test_gymnasium_checks_it(env):
+def test_gymnasiums_checker_passes(env):
     check_env(env.unwrapped)
 
 
-def test_an_episode_is_the_transition_of_the_model(env):
+def test_step_is_the_transition(env):
     scenario = env.unwrapped.scenario
     observation, info = env.reset(seed=3)
     assert_allclose(observation, np.repeat([1.0, 0.0], 12), atol=1e-6)
@@ -40,7 +41,7 @@ def test_an_episode_is_the_transition_of_the_model(env):
         action = (5 * slot) % 12
         state, outcome = step(scenario.params, scenario.layout, state, action, volumes)
         observation, reward, terminated, truncated, info = env.step(action)
-        assert_allclose(observation, observe(scenario.layout, state), rtol=1e-6)
+        assert_allclose(observation, observe(scenario.params, scenario.layout, state), rtol=1e-6)
         assert np.isfinite(reward)
         assert not truncated
         assert terminated == (outcome.cause != um.Cause.NONE)
@@ -74,7 +75,7 @@ def test_render_draws_the_map(env):
         UavMecGymEnv(render_mode="human")
 
 
-def test_vector_environment_is_many_single_ones():
+def test_vector_environment_is_deterministic_and_resets_itself():
     envs = gymnasium.make_vec(ENV_ID, num_envs=4)
     first, _ = envs.reset(seed=1)
     assert first.shape == (4, 24)
@@ -85,41 +86,47 @@ def test_vector_environment_is_many_single_ones():
     for slot in range(25):
         actions = np.array([slot, 2 * slot, 0, 7 * slot]) % 12
         observation, reward, terminated, truncated, info = envs.step(actions)
-        same = again.step(actions)
-        assert_array_equal(observation, same[0])
-        assert_array_equal(reward, same[1])
+        chex.assert_trees_all_equal((observation, reward), again.step(actions)[:2])
         assert observation.dtype == np.float32
         assert terminated.dtype == truncated.dtype == bool
         ended = terminated | truncated
         assert_array_equal(info["cause"] != "none", ended)
         if ended.any():
             assert_array_equal(info["_final_obs"], ended)
-            assert_allclose(observation[ended], first[ended], atol=1e-6)  # restarted in the same step
-            for place in np.flatnonzero(ended):
-                assert (info["final_obs"][place] != observation[place]).any()
-                assert info["final_info"]["failed"][place].any() or info["cause"][place] == "uav"
+            assert_allclose(observation[ended], first[ended], atol=1e-6)  # reset in the same step
+            for index in np.flatnonzero(ended):
+                assert (info["final_obs"][index] != observation[index]).any()
+                assert info["final_info"]["failed"][index].any() or info["cause"][index] == "uav"
         ended_before |= ended
     assert ended_before.all()
 
 
-def test_vector_environment_takes_one_scenario_or_as_many_as_there_are():
+def test_vector_environment_takes_one_scenario_or_one_for_each():
     scenario = make_scenario()
     assert UavMecVectorEnv(3, scenario).reset(seed=0)[0].shape == (3, 24)
-    many = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), scenario)
+    two = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), scenario)
+    assert UavMecVectorEnv(2, two).reset(seed=0)[0].shape == (2, 24)
     with pytest.raises(ValueError, match="scenario holds 2 layouts; it should hold 3"):
-        UavMecVectorEnv(3, many)
+        UavMecVectorEnv(3, two)
 
 
-def test_seeds_make_the_volumes():
+def test_vector_environment_wants_one_action_for_each_environment():
+    envs = UavMecVectorEnv(3)
+    envs.reset(seed=0)
+    with pytest.raises(AssertionError, match="shape"):
+        envs.step(np.zeros(2, int))
+
+
+def test_the_seed_determines_the_volumes():
     envs = UavMecVectorEnv(2, make_scenario())
 
-    def ages_and_batteries(seed):
+    def observations(seed):
         envs.reset(seed=seed)
         return np.stack([envs.step(np.array([3, 3]))[0] for _ in range(3)])
 
-    assert_array_equal(ages_and_batteries(0), ages_and_batteries(0))
-    assert (ages_and_batteries(0) != ages_and_batteries(1)).any()
-    batteries = ages_and_batteries(0)[:, :, :12]
+    assert_array_equal(observations(0), observations(0))
+    assert (observations(0) != observations(1)).any()
+    batteries = observations(0)[:, :, :12]
     assert (batteries[:, 0] != batteries[:, 1]).any()  # the same layout, other volumes
 
 

@@ -82,8 +82,8 @@ def test_batched_states_and_numpy_observations(run, ppo_policy, kind):
     assert actions.shape == (3, 2)
     alone = jax.vmap(jax.vmap(lambda state: policy(um.Params(), layout, state)))(states)
     assert_array_equal(actions, alone)
-    assert_array_equal(policy.act(np.asarray(observe(layout, states))), actions)
-    assert policy.act(np.asarray(observe(layout, state))).shape == ()
+    assert_array_equal(policy.act(np.asarray(observe(um.Params(), layout, states))), actions)
+    assert policy.act(np.asarray(observe(um.Params(), layout, state))).shape == ()
 
 
 def test_a_policy_of_its_own_file(ppo_policy, tmp_path):

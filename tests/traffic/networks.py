@@ -1,4 +1,4 @@
-"""Small road networks whose answers are known, and extracts and evacuations made of them."""
+"""Small road networks, map extracts and evacuations with known answers."""
 
 from itertools import product
 from pathlib import Path
@@ -8,23 +8,33 @@ import numpy as np
 from uavmec_jax.traffic.evacuation import Evacuation
 from uavmec_jax.traffic.network import Road, RoadNetwork
 
-LIVES = ("west", "middle", "east")
-"""Junctions of a village street, 100 m apart; a primary road leads 500 m from the east one to the exit."""
+
+def road(start, end, road_class, junctions, lanes=1, name=""):
+    """Make a straight road between two junctions."""
+    shape = np.array([junctions[start], junctions[end]], float)
+    length = float(np.linalg.norm(shape[1] - shape[0]))
+    return Road(f"{start}-{end}", name, road_class, lanes, 13.4, length, start, end, shape)
 
 
-def road(start, end, kind, places, lanes=1, name=""):
-    shape = np.array([places[start], places[end]], float)
-    return Road(
-        f"{start}-{end}", name, kind, lanes, 13.4, float(np.linalg.norm(shape[1] - shape[0])), start, end, shape
-    )
+def both_ways(a, b, road_class, junctions, lanes=1):
+    """Make the two directions of a road."""
+    return [road(a, b, road_class, junctions, lanes), road(b, a, road_class, junctions, lanes)]
 
 
-def village(exit_kind="primary", cut=False) -> RoadNetwork:
-    """A village street with a highway to the south, and a loop road that nothing leads out of.
+def network(roads, successors, junctions) -> RoadNetwork:
+    """Make a network of roads; the junctions are points in metres."""
+    points = {name: (float(x), float(y)) for name, (x, y) in junctions.items()}
+    return RoadNetwork({road.id: road for road in roads}, successors, points, "0" * 64, Path("none"))
 
-    ``cut``: the village itself has no way to the highway.
+
+def village(exit_class="primary", cut=False) -> RoadNetwork:
+    """Make a village street of 200 m, a road from its east end 500 m south to the exit, and a loop without a way out.
+
+    Args:
+        exit_class: class of the road to the exit.
+        cut: whether there is no way from the street to that road.
     """
-    places = {
+    junctions = {
         "west": (0, 0),
         "middle": (100, 0),
         "east": (200, 0),
@@ -32,29 +42,24 @@ def village(exit_kind="primary", cut=False) -> RoadNetwork:
         "loop": (900, 0),
         "end": (900, 300),
     }
-    pairs = [("west", "middle"), ("middle", "east")]
-    roads = [road(a, b, "residential", places) for one in pairs for a, b in (one, one[::-1])]
-    roads += [road("loop", "end", "residential", places), road("end", "loop", "residential", places)]
-    roads += [road("east", "south", exit_kind, places, lanes=2), road("south", "east", exit_kind, places, lanes=2)]
-    named = {one.id: one for one in roads}
-    onward = {
-        one.id: tuple(
-            other.id
-            for other in roads
-            if other.start == one.end
-            and not (cut and {one.end, other.start} == {"east"} and "south" in (one.start, other.end))
-        )
-        for one in roads
-    }
-    return RoadNetwork(
-        named, onward, {name: (float(x), float(y)) for name, (x, y) in places.items()}, "0" * 64, Path("none")
+    roads = both_ways("west", "middle", "residential", junctions) + both_ways(
+        "middle", "east", "residential", junctions
     )
+    roads += both_ways("loop", "end", "residential", junctions)
+    roads += both_ways("east", "south", exit_class, junctions, lanes=2)
+
+    def joined(before, after):
+        is_cut = cut and before.end == "east" and "south" in (before.start, after.end)
+        return before.end == after.start and not is_cut
+
+    successors = {before.id: tuple(after.id for after in roads if joined(before, after)) for before in roads}
+    return network(roads, successors, junctions)
 
 
 def evacuation(
     weight=(1.0, 0.5, 0.1), windows=((0.0, 0.2, 0.1), (1.0, 0.4, 0.1)), name="hamlet", span=300.0
 ) -> Evacuation:
-    """An evacuation of invented densities: devices on a diagonal, two roads."""
+    """Make an evacuation with invented densities: devices on a diagonal, two roads."""
     weight, windows = np.array(weight, np.float32), np.array(windows, np.float32)
     n = len(weight)
     meta = {
@@ -92,8 +97,8 @@ def evacuation(
     )
 
 
-def osm_town(rows=4, columns=4, spacing=0.0015) -> str:
-    """An OpenStreetMap extract: a grid of residential streets between 9.70 E, 50.00 N and a motorway's two carriageways."""
+def osm_extract(rows=4, columns=4, spacing=0.0015) -> str:
+    """Make an OpenStreetMap extract: a grid of streets from 9.70 E, 50.00 N on, and the two carriageways of a motorway."""
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', '<osm version="0.6" generator="by hand">']
     number = {}
     for row, column in product(range(rows), range(columns)):
@@ -111,7 +116,7 @@ def osm_town(rows=4, columns=4, spacing=0.0015) -> str:
         ([number[0, columns - 1], 901], "motorway_link", "yes"),
         ([911, number[0, columns - 1]], "motorway_link", "yes"),
     ]
-    for k, (nodes, kind, oneway) in enumerate(ways):
+    for k, (nodes, road_class, oneway) in enumerate(ways):
         lines.append(f'<way id="{500 + k}">' + "".join(f'<nd ref="{node}"/>' for node in nodes))
-        lines.append(f'<tag k="highway" v="{kind}"/><tag k="oneway" v="{oneway}"/></way>')
+        lines.append(f'<tag k="highway" v="{road_class}"/><tag k="oneway" v="{oneway}"/></way>')
     return "\n".join([*lines, "</osm>"])

@@ -1,4 +1,4 @@
-"""`uavmec traffic`: what it prints, and one line for what does not fit. Nothing here starts SUMO."""
+"""`uavmec traffic`: its output, and one line for bad input. No test here starts SUMO."""
 
 import json
 import subprocess
@@ -7,7 +7,7 @@ import sys
 import pytest
 from click.testing import CliRunner
 
-from tests.traffic.networks import osm_town
+from tests.traffic.networks import osm_extract
 from uavmec_jax.cli import main
 from uavmec_jax.traffic import sumo
 
@@ -17,12 +17,12 @@ def uavmec(*arguments):
 
 
 def test_show():
-    told = json.loads(uavmec("traffic", "show", "albany", "--json").stdout)
-    assert [device["number"] for device in told["devices"] if device["high_traffic"]] == [1, 2, 3, 12]
-    assert told["meta"]["teleports"]
-    shown = uavmec("traffic", "show", "round_lake").stdout
-    assert "hand-made approximation" in shown
-    assert "simulations; roads" in shown
+    data = json.loads(uavmec("traffic", "show", "albany", "--json").stdout)
+    assert [device["number"] for device in data["devices"] if device["high_traffic"]] == [1, 2, 3, 12]
+    assert data["meta"]["teleports"]
+    text = uavmec("traffic", "show", "round_lake").stdout
+    assert "hand-made approximation" in text
+    assert "simulations; roads" in text
 
 
 def test_figure(tmp_path):
@@ -36,8 +36,8 @@ def test_animation_and_plan_of_a_place(tmp_path):
     done = uavmec("traffic", "show", "albany", "--animation", tmp_path / "a.gif", "--policy", "oldest-first")
     assert done.exit_code == 0, done.output
     assert (tmp_path / "a.gif").stat().st_size > 100_000
-    told = json.loads(uavmec("evaluate", "oldest-first", "--place", "albany", "--draws", "2", "--json").stdout)
-    assert told["policies"][0]["mean"] > 10
+    data = json.loads(uavmec("evaluate", "oldest-first", "--place", "albany", "--draws", "2", "--json").stdout)
+    assert data["policies"][0]["mean"] > 10
     plan = uavmec("plan", "--place", "albany", "--draws", "1", "--width", "8", "--out", tmp_path / "plan", "--json")
     assert "South Mall Arterial and I-787 exit 3" in plan.stdout
 
@@ -47,7 +47,7 @@ BAD = [
     (["show", "x.osm"], "x.osm: cannot be read: "),
     (["show", "albany", "--figure", "map.bmp"], "map.bmp: ends in '.bmp'; it should end in .png or .svg or .pdf"),
     (["show", "albany", "--animation", "map.mp4"], "map.mp4: ends in '.mp4'; it should end in .gif"),
-    (["show", "albany", "--animation", "a.gif", "--powered", "13"], "--powered is 13; give 0 to 12"),
+    (["show", "albany", "--animation", "a.gif", "--powered", "13"], "powered is 13; give 0 to 12"),
     (["show", "albany", "--animation", "a.gif", "--policy", "oldest"], "oldest: neither a file nor a policy by name"),
     (["build"], "give one of PLACE, --osm FILE and --net FILE"),
     (["build", "albany", "--osm", "x.osm"], "give one of PLACE, --osm FILE and --net FILE"),
@@ -76,8 +76,8 @@ BAD = [
 )
 def test_bad_input_is_one_line_and_exit_code_2(tmp_path, monkeypatch, arguments, line):
     files = {
-        "x.osm": osm_town(),
-        "broken.osm": osm_town()[:500],
+        "x.osm": osm_extract(),
+        "broken.osm": osm_extract()[:500],
         "empty.toml": "",
         "x.sumocfg": "<configuration><output><summary-output value='evil.xml'/></output></configuration>",
     }
@@ -86,8 +86,8 @@ def test_bad_input_is_one_line_and_exit_code_2(tmp_path, monkeypatch, arguments,
     monkeypatch.chdir(tmp_path)
     done = uavmec("traffic", *arguments)
     assert done.exit_code == 2, done.output
-    said = done.stderr.removeprefix("uavmec: ").removeprefix(f"{tmp_path}/")
-    assert said.startswith(line)
+    message = done.stderr.removeprefix("uavmec: ").removeprefix(f"{tmp_path}/")
+    assert message.startswith(line)
     assert done.stderr.count("\n") == 1
     assert {file.name for file in tmp_path.iterdir()} == set(files)  # nothing was written
 
@@ -98,7 +98,7 @@ def test_without_sumo_one_line_says_how_to_get_it(tmp_path, monkeypatch):
 
     monkeypatch.setattr(sumo.importlib, "import_module", missing)
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "x.osm").write_text(osm_town())
+    (tmp_path / "x.osm").write_text(osm_extract())
     for arguments in (["build", "albany"], ["build", "--osm", "x.osm"]):
         done = uavmec("traffic", *arguments)
         assert done.exit_code == 2

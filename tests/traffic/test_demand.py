@@ -1,4 +1,4 @@
-"""AgentIds drives where and when."""
+"""Travel demand: origins, exits, departure times and trips."""
 
 import xml.etree.ElementTree as ElementTree
 

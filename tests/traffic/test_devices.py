@@ -1,7 +1,6 @@
-"""Where devices stand, and what they see."""
+"""Positions of the devices, and the traffic density near them."""
 
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,13 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from tests.traffic.networks import road, village
+from tests.traffic.networks import both_ways, network, road, village
 from uavmec_jax.errors import TrafficError
 from uavmec_jax.traffic.demand import find_routes
-from uavmec_jax.traffic.devices import _named, farthest_points, place_devices
-from uavmec_jax.traffic.network import RoadNetwork
+from uavmec_jax.traffic.devices import _junction_names, farthest_points, place_devices
 from uavmec_jax.traffic.place import Demand, make_place
-from uavmec_jax.traffic.weights import density_near, length_within, scaled
+from uavmec_jax.traffic.weights import density_near, divide_by_maximum, length_within
 
 LINE = np.array([[-1000.0, 0.0], [1000.0, 0.0]])
 
@@ -39,9 +37,9 @@ def test_length_in_a_circle_against_small_steps(corners, x, y):
         * (np.linalg.norm((piece[1:] + piece[:-1]) / 2 - [x, y], axis=1) <= 120).sum()
         for piece in pieces
     )
-    found = length_within(shape, np.array([[x, y]]), 120.0)[0]
-    assert found == pytest.approx(brute, abs=1.0 * len(pieces) + 1e-3)
-    assert found >= 0
+    length = length_within(shape, np.array([[x, y]]), 120.0)[0]
+    assert length == pytest.approx(brute, abs=1.0 * len(pieces) + 1e-3)
+    assert length >= 0
 
 
 def test_density_is_a_mean_over_lanes_and_metres():
@@ -54,8 +52,8 @@ def test_density_is_a_mean_over_lanes_and_metres():
 
 
 def test_weights_are_between_0_and_1():
-    assert_allclose(scaled(np.array([2.0, 8.0, 0.0])), [0.25, 1, 0])
-    assert_allclose(scaled(np.zeros(3)), 0)
+    assert_allclose(divide_by_maximum(np.array([2.0, 8.0, 0.0])), [0.25, 1, 0])
+    assert_allclose(divide_by_maximum(np.zeros(3)), 0)
 
 
 def test_farthest_points_spread():
@@ -66,55 +64,59 @@ def test_farthest_points_spread():
 
 
 def grid():
-    """5 x 5 junctions 100 m apart; the traffic is on the southern street, which a highway continues."""
-    places = {f"{x}{y}": (100.0 * x, 100.0 * y) for x in range(5) for y in range(5)} | {"out": (900.0, 0.0)}
+    """Make 5 x 5 junctions 100 m apart, and a highway that continues the southern street."""
+    junctions = {f"{x}{y}": (100.0 * x, 100.0 * y) for x in range(5) for y in range(5)} | {"out": (900.0, 0.0)}
     pairs = [(f"{x}{y}", f"{x + 1}{y}") for x in range(4) for y in range(5)]
     pairs += [(f"{x}{y}", f"{x}{y + 1}") for x in range(5) for y in range(4)]
-    roads = [road(a, b, "residential", places) for one in pairs for a, b in (one, one[::-1])]
-    roads.append(road("40", "out", "primary", places))
-    onward = {one.id: tuple(other.id for other in roads if other.start == one.end) for one in roads}
-    return RoadNetwork({one.id: one for one in roads}, onward, places, "", Path("none"))
+    roads = [road for a, b in pairs for road in both_ways(a, b, "residential", junctions)]
+    roads.append(road("40", "out", "primary", junctions))
+    successors = {before.id: tuple(after.id for after in roads if after.start == before.end) for before in roads}
+    return network(roads, successors, junctions)
 
 
-def placed(network, **devices):
-    place = make_place({"name": "g", "network": {"net": "x"}, "devices": devices}, "g")
-    density = np.array(
-        [40.0 if one.start.endswith("0") and one.end.endswith("0") else 1.0 for one in network.roads.values()]
-    )
-    return place_devices(place, network, find_routes(network, Demand(), "g"), density)
+def place_in_grid(**devices):
+    """Place devices in the grid, with the traffic on its southern street."""
+    place, roads = make_place({"name": "g", "network": {"net": "x"}, "devices": devices}, "g"), grid()
+    on_southern_street = [road.start.endswith("0") and road.end.endswith("0") for road in roads.roads.values()]
+    return place_devices(place, roads, find_routes(roads, Demand(), "g"), np.where(on_southern_street, 40.0, 1.0))
 
 
 def test_a_stated_share_stands_on_the_corridors():
-    network = grid()
-    names, position = placed(network, count=6, corridor_share=0.5, span_m=900.0, radius_m=60.0)
+    names, position = place_in_grid(count=6, corridor_share=0.5, span_m=900.0, radius_m=60.0)
     assert len(set(names)) == 6
     assert sum(name.endswith("0") for name in names) == 3
     assert position.shape == (6, 2)
-    names, _ = placed(network, count=6, corridor_share=0.0, span_m=900.0, radius_m=60.0)
+    names, _ = place_in_grid(count=6, corridor_share=0.0, span_m=900.0, radius_m=60.0)
     assert not any(name.endswith("0") for name in names)
 
 
-def test_devices_are_called_after_their_streets():
-    places = {"a": (0, 0), "b": (100, 0), "c": (200, 0), "d": (200, 100), "e": (300, 0)}
+def test_devices_are_named_after_their_streets():
+    junctions = {"a": (0, 0), "b": (100, 0), "c": (200, 0), "d": (200, 100), "e": (300, 0)}
     pairs = {"ab": "High Street", "bc": "High Street", "cd": "Mill Lane", "ce": ""}
-    roads = [road(*pair, "residential", places, name=name) for pair, name in pairs.items()]
-    network = RoadNetwork({one.id: one for one in roads}, {}, places, "", Path("none"))
-    assert _named(["a", "c", "d", "e"], network) == ["High Street", "High Street and Mill Lane", "Mill Lane", "e"]
-    assert _named(["a", "b"], network) == ["High Street (a)", "High Street (b)"]
+    roads = [road(*pair, "residential", junctions, name=name) for pair, name in pairs.items()]
+    named = network(roads, {}, junctions)
+    assert _junction_names(["a", "c", "d", "e"], named) == [
+        "High Street",
+        "High Street and Mill Lane",
+        "Mill Lane",
+        "e",
+    ]
+    assert _junction_names(["a", "b"], named) == ["High Street (a)", "High Street (b)"]
 
 
 def test_more_devices_than_junctions():
     with pytest.raises(
         TrafficError, match=r"g: 30 devices, but 25 junctions in the 900 m around where people live \(26 in"
     ):
-        placed(grid(), count=30, span_m=900.0)
+        place_in_grid(count=30, span_m=900.0)
 
 
 def test_sites_of_a_file():
     sites = [{"name": "a", "junction": "east"}, {"name": "b", "x_m": 5.0, "y_m": 6.0}]
     place = make_place({"name": "v", "network": {"net": "x"}, "device": sites}, "v")
-    network = village()
-    names, position = place_devices(place, network, find_routes(network, Demand(), "v"), np.zeros(len(network.roads)))
+    roads = village()
+    routes, density = find_routes(roads, Demand(), "v"), np.zeros(len(roads.roads))
+    names, position = place_devices(place, roads, routes, density)
     assert names == ["a", "b"]
     assert_allclose(position, [[200, 0], [5, 6]])
     sites[0]["junction"] = "esat"
@@ -122,4 +124,4 @@ def test_sites_of_a_file():
     with pytest.raises(
         TrafficError, match="v: device 'a': junction is 'esat', which does not exist; did you mean 'west'"
     ):
-        place_devices(place, network, find_routes(network, Demand(), "v"), np.zeros(len(network.roads)))
+        place_devices(place, roads, routes, density)

@@ -1,4 +1,4 @@
-"""The file that a simulated evacuation leaves."""
+"""The file of a simulated evacuation."""
 
 import dataclasses
 
@@ -19,43 +19,43 @@ PAPER = {"round_lake": [2, 3, 4, 5, 7, 10], "albany": [1, 2, 3, 12]}
 
 @pytest.mark.parametrize("name", PAPER)
 def test_shipped_evacuations(name):
-    found = load_evacuation(name)
+    loaded = load_evacuation(name)
     place, _ = load_place(name)
-    assert found.name == name
-    assert found.meta["names"] == [site.name for site in place.device]
-    assert found.meta["settings"] == place.model_dump(mode="json")  # the file is that of the place as it stands
-    assert (np.flatnonzero(found.busy) + 1).tolist() == PAPER[name]
-    assert np.abs(found.weight - HIGH_TRAFFIC).min() > 0.05  # nobody is near the line
-    assert found.weight.max() == found.window_weight.max() == 1
-    assert found.window_weight.shape == (12, 12)
-    assert found.meta["warnings"] == []
-    assert len(found.meta["teleports"]) == 10
-    assert sum(found.meta["teleports"]) < 0.01 * sum(found.meta["loaded"])
-    assert len(found.roads) == len(found.meta["roads"]) == found.road_density.shape[1]
-    found.check_hops(speed_m_s=5.0, slot_cap_s=600.0)
-    assert_allclose(found.weight, found.density / found.density.max(), rtol=1e-6)
+    assert loaded.name == name
+    assert loaded.meta["names"] == [site.name for site in place.device]
+    assert loaded.meta["settings"] == place.model_dump(mode="json")  # built with the present settings of the place
+    assert (np.flatnonzero(loaded.busy) + 1).tolist() == PAPER[name]
+    assert np.abs(loaded.weight - HIGH_TRAFFIC).min() > 0.05  # no device is near the threshold
+    assert loaded.weight.max() == loaded.window_weight.max() == 1
+    assert loaded.window_weight.shape == (12, 12)
+    assert loaded.meta["warnings"] == []
+    assert len(loaded.meta["teleports"]) == 10
+    assert sum(loaded.meta["teleports"]) < 0.01 * sum(loaded.meta["loaded"])
+    assert len(loaded.roads) == len(loaded.meta["roads"]) == loaded.road_density.shape[1]
+    loaded.check_hops(speed_m_s=5.0, slot_cap_s=600.0)
+    assert_allclose(loaded.weight, loaded.density / loaded.density.max(), rtol=1e-6)
 
 
-def test_a_town_evacuates_and_is_empty_afterwards():
+def test_shipped_places_are_nearly_empty_at_the_end():
     for name in PAPER:
         density = load_evacuation(name).road_density.mean(axis=1)
         assert density[-1] < 0.25 * density.max()
 
 
 def test_positions_are_metres_from_the_south_west_corner():
-    found = evacuation(span=300.0)
-    assert_allclose(found.local_position(), [[0, 0], [150, 75], [300, 150]])
-    assert found.region_m() == (300, 150)
-    assert_allclose(found.local_position(800.0)[-1], [800, 400])
-    assert found.region_m(800.0) == (800, 400)
+    place = evacuation(span=300.0)
+    assert_allclose(place.local_position(), [[0, 0], [150, 75], [300, 150]])
+    assert place.region_m() == (300, 150)
+    assert_allclose(place.local_position(800.0)[-1], [800, 400])
+    assert place.region_m(800.0) == (800, 400)
 
 
 def test_hops_fit_into_a_slot():
-    found = evacuation(span=3000.0)  # the longest hop: 3,354 m, 671 s at 5 m/s
-    found.check_hops(5.0, 700.0)
-    found.check_hops(5.0, 600.0, scale_to_m=800.0)
+    place = evacuation(span=3000.0)  # the longest hop: 3,354 m, 671 s at 5 m/s
+    place.check_hops(5.0, 700.0)
+    place.check_hops(5.0, 600.0, scale_to_m=800.0)
     with pytest.raises(TrafficError) as caught:
-        found.check_hops(5.0, 600.0)
+        place.check_hops(5.0, 600.0)
     assert str(caught.value) == (
         "hamlet: the hop from the start to site 3, 3,354 m, takes 671 s at 5 m/s; a slot lasts at most 600 s "
         "(slot_cap_s); place the devices closer or set place_scale_m"
@@ -63,25 +63,25 @@ def test_hops_fit_into_a_slot():
 
 
 def test_round_trip(tmp_path):
-    mine = evacuation()
-    mine.save(tmp_path / "town.npz")
-    again = load_evacuation(tmp_path / "town.npz")
-    assert again.meta == mine.meta
-    for field in dataclasses.fields(mine)[1:]:
-        assert_array_equal(getattr(again, field.name), getattr(mine, field.name))
+    saved = evacuation()
+    saved.save(tmp_path / "place.npz")
+    again = load_evacuation(tmp_path / "place.npz")
+    assert again.meta == saved.meta
+    for field in dataclasses.fields(saved)[1:]:
+        assert_array_equal(getattr(again, field.name), getattr(saved, field.name))
     assert [len(shape) for shape in again.roads] == [2, 3]
     assert_allclose(again.mean_road_density, [2, 40])
-    assert [file.name for file in tmp_path.iterdir()] == ["town.npz"]
+    assert [file.name for file in tmp_path.iterdir()] == ["place.npz"]
 
 
 def test_files_that_are_no_evacuations(tmp_path):
-    path = tmp_path / "town.npz"
+    path = tmp_path / "place.npz"
 
     def refused(line, source=path):
         with pytest.raises(TrafficError, match=line):
             load_evacuation(source)
 
-    refused("town.npz: cannot be read: No such file|town.npz: cannot be read: .*No such file")
+    refused("place.npz: cannot be read: No such file|place.npz: cannot be read: .*No such file")
     refused("albania: neither a file nor a shipped place; did you mean 'albany'?", "albania")
     evacuation().save(path)
     whole = path.read_bytes()
@@ -95,7 +95,9 @@ def test_files_that_are_no_evacuations(tmp_path):
             same = load_evacuation(path)
         except TrafficError:
             continue
-        assert_array_equal(same.weight, evacuation().weight)  # a bit that nothing depends on, as the time of a member
+        assert_array_equal(
+            same.weight, evacuation().weight
+        )  # a bit that nothing depends on, such as the time of a member
     path.write_bytes(b"<osm/>")
     refused("cannot be read")
     np.savez(path, weight=np.zeros(3))
@@ -107,7 +109,7 @@ def test_files_that_are_no_evacuations(tmp_path):
 
 
 def test_an_altered_weight_is_noticed(tmp_path):
-    path = tmp_path / "town.npz"
+    path = tmp_path / "place.npz"
     evacuation().save(path)
     with np.load(path) as arrays:
         altered = {name: arrays[name] for name in arrays.files}

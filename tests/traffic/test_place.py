@@ -1,11 +1,11 @@
-"""Places: what their files may hold."""
+"""Files of places."""
 
 import pytest
 
 from uavmec_jax.errors import TrafficError
 from uavmec_jax.traffic.place import load_place, make_place, shipped_places
 
-OSM = {"name": "x", "network": {"osm": "town.osm"}}
+OSM = {"name": "x", "network": {"osm": "extract.osm"}}
 
 
 def test_shipped_places_have_twelve_named_devices():

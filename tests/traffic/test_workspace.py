@@ -1,4 +1,4 @@
-"""Programs in a temporary folder: limits, last words, and nothing left behind."""
+"""Programs in a temporary folder: time limits, errors, and nothing left behind."""
 
 import os
 import signal
@@ -10,54 +10,54 @@ from pathlib import Path
 import pytest
 
 from uavmec_jax.errors import TrafficError
-from uavmec_jax.traffic.workspace import Workshop, last_error
+from uavmec_jax.traffic.workspace import Workspace, last_error
 
 
 def python(code):
     return [sys.executable, "-c", code]
 
 
-def test_it_runs_in_a_folder_that_goes_away():
-    with Workshop() as workshop:
-        folder = workshop.folder
-        assert workshop.run("p", python("open('x', 'w').write('y'); print('told')"), limit_s=20) == "told\n"
+def test_programs_run_in_a_folder_that_is_removed():
+    with Workspace() as workspace:
+        folder = workspace.folder
+        assert workspace.run("p", python("open('x', 'w').write('y'); print('done')"), limit_s=20) == "done\n"
         assert (folder / "x").read_text() == "y"
-        shown = workshop.run("p", python("import os; print(os.environ['GIVEN'])"), limit_s=20, env={"GIVEN": "here"})
-        assert shown == "here\n"
+        printed = workspace.run("p", python("import os; print(os.environ['GIVEN'])"), limit_s=20, env={"GIVEN": "here"})
+        assert printed == "here\n"
     assert not folder.exists()
 
 
-def test_failures_tell_the_last_error():
+def test_failures_report_the_last_error():
     code = "import sys; sys.stderr.write('Warning: a\\nError: the road is cut\\nQuitting (on error).\\n'); sys.exit(1)"
-    with Workshop() as workshop:
+    with Workspace() as workspace:
         with pytest.raises(TrafficError, match=r"^netconvert: the road is cut$"):
-            workshop.run("netconvert", python(code), limit_s=20)
+            workspace.run("netconvert", python(code), limit_s=20)
         with pytest.raises(TrafficError, match=r"^p: ended with exit code 3$"):
-            workshop.run("p", python("raise SystemExit(3)"), limit_s=20)
+            workspace.run("p", python("raise SystemExit(3)"), limit_s=20)
         with pytest.raises(TrafficError, match=r"^p: ended with exit code -9$"):
-            workshop.run("p", python("import os; os.kill(os.getpid(), 9)"), limit_s=20)
+            workspace.run("p", python("import os; os.kill(os.getpid(), 9)"), limit_s=20)
         with pytest.raises(TrafficError, match=r"p: did not end within its limit of 0.2 s and was stopped"):
-            workshop.run("p", python("import time; time.sleep(60)"), limit_s=0.2)
-        folder = workshop.folder
+            workspace.run("p", python("import time; time.sleep(60)"), limit_s=0.2)
+        folder = workspace.folder
     assert not folder.exists()
     assert last_error("one\ntwo") == "two"
     assert last_error("") == ""
 
 
-def test_it_works_on_without_its_guardian():
-    with Workshop() as workshop:
-        workshop._guardian.kill()
-        workshop._guardian.wait()
-        assert workshop.run("p", python("print(1)"), limit_s=20) == "1\n"
-        folder = workshop.folder
+def test_it_works_on_without_its_watchdog():
+    with Workspace() as workspace:
+        workspace._watchdog.kill()
+        workspace._watchdog.wait()
+        assert workspace.run("p", python("print(1)"), limit_s=20) == "1\n"
+        folder = workspace.folder
     assert not folder.exists()
 
 
-def test_after_a_stop_nothing_is_started():
-    with Workshop() as workshop:
-        workshop.stop()
+def test_nothing_is_started_after_a_stop():
+    with Workspace() as workspace:
+        workspace.stop()
         with pytest.raises(TrafficError, match="stopped before it was started"):
-            workshop.run("p", python("1"), limit_s=20)
+            workspace.run("p", python("1"), limit_s=20)
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT], ids=lambda how: how.name)
@@ -65,11 +65,11 @@ def test_nothing_is_left_behind_when_killed(tmp_path, how):
     code = f"""
 import sys
 from pathlib import Path
-from uavmec_jax.traffic.workspace import Workshop
+from uavmec_jax.traffic.workspace import Workspace
 sleeper = "import os, time; open('pid', 'w').write(str(os.getpid())); os.rename('pid', '{tmp_path}/pid'); time.sleep(600)"
-with Workshop() as workshop:
-    Path("{tmp_path}/folder").write_text(str(workshop.folder))
-    workshop.run("p", [sys.executable, "-c", sleeper], limit_s=600)
+with Workspace() as workspace:
+    Path("{tmp_path}/folder").write_text(str(workspace.folder))
+    workspace.run("p", [sys.executable, "-c", sleeper], limit_s=600)
 """
     process = subprocess.Popen(python(code), stderr=subprocess.DEVNULL)
     wait_for((tmp_path / "pid").exists)
@@ -82,7 +82,7 @@ with Workshop() as workshop:
 
 
 def alive(pid):
-    """Whether a process runs; one that has ended and that nobody has asked after does not."""
+    """Return whether a process runs; a zombie does not."""
     try:
         os.kill(pid, 0)
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"

@@ -248,7 +248,7 @@ def _act(
     """One epsilon-greedy environment step and the row to remember it by."""
     n = spec.n_devices
     scenario, layout = agent.scenario, agent.scenario.layout
-    best = greedy(spec, agent.hyper, state.weights, observe(layout, state.env_state))
+    best = greedy(spec, agent.hyper, state.weights, observe(scenario.params, layout, state.env_state))
     anywhere = jnp.minimum((uniform[n + 1] * n).astype(jnp.int32), n - 1)
     warm_up = steps_done < agent.hyper.learning_starts
     explore = warm_up | (uniform[n] < epsilon(agent.hyper, spec.total_steps, steps_done))

@@ -14,7 +14,7 @@ from jaxtyping import Array
 from uavmec_jax.agents.networks import ActorCritic, EquivariantActorCritic
 from uavmec_jax.env.dynamics import State
 from uavmec_jax.env.layout import Layout
-from uavmec_jax.env.observation import observe_as_paper
+from uavmec_jax.env.observation import observe
 from uavmec_jax.env.params import Params
 from uavmec_jax.planning.observation import FEATURES, observe_devices
 
@@ -48,7 +48,7 @@ def _equivariant(n_devices: int, hidden: tuple[int, ...]) -> Any:
 
 OBSERVATIONS: Mapping[str, ObservationSpec] = MappingProxyType(
     {
-        "paper": ObservationSpec(observe_as_paper, lambda n: 2 * n, ActorCritic),
+        "paper": ObservationSpec(observe, lambda n: 2 * n, ActorCritic),
         "full": ObservationSpec(_see_all, lambda n: n * (len(FEATURES) + 1), _equivariant),
     }
 )

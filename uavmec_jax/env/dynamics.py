@@ -1,10 +1,10 @@
-"""One time slot of the network: a pure function of explicit task volumes (paper, sections 3.1 and 4)."""
+"""The dynamics of one time slot, a pure function of explicit task volumes (paper, sections 3.1 and 4)."""
 
 import enum
 import math
 from dataclasses import replace
-from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -19,7 +19,7 @@ class Cause(enum.IntEnum):
     """Why an episode ended."""
 
     NONE = 0
-    """It goes on."""
+    """It has not ended."""
     BATTERY = 1
     """A device's battery is empty (constraint 1e)."""
     DATA_AGE = 2
@@ -30,15 +30,15 @@ class Cause(enum.IntEnum):
 
 @struct.dataclass
 class State:
-    """What changes from slot to slot.
+    """The state of the network between two slots.
 
     Attributes:
-        battery: ``[n]`` J left in each device.
-        age: ``[n]`` int32, slots since each device's data last got out.
-        uav_position: ``[2]`` m.
-        uav_energy: J left in the UAV.
-        slot: int32, slots completed.
-        elapsed: s, length of the slots completed.
+        battery: energy left in each device, J.
+        age: slots since each device's data were last delivered, int32.
+        uav_position: m.
+        uav_energy: energy left in the UAV, J.
+        slot: slots completed, int32.
+        elapsed: total length of the slots completed, s.
     """
 
     battery: Float[Array, "*batch n"]
@@ -51,15 +51,15 @@ class State:
 
 @struct.dataclass
 class Outcome:
-    """What one slot did.
+    """The result of one slot.
 
     Attributes:
-        cause: int32, a :class:`Cause`.
-        failed: ``[n]`` bool, every device that failed in this slot.
-        served: ``[n]`` bool, the devices within range of the hover point.
-        duration: s, length of the slot (0 if it never started).
-        first_failure: ``[n]`` f32, share of each device in the first failure, summing to 1 if a device failed:
-            all of it on the battery that runs out earliest inside the slot; expired data share equally.
+        cause: why the episode ended with this slot, a :class:`Cause` as int32.
+        failed: devices that failed in this slot.
+        served: devices within range of the hover point.
+        duration: length of the slot, s; 0 if it never started.
+        first_failure: each device's share in the first failure. Shares sum to 1 if a device failed: the battery that
+            runs out earliest inside the slot has all of it; devices whose data expired share it equally.
     """
 
     cause: Int[Array, "*batch"]
@@ -70,7 +70,7 @@ class Outcome:
 
 
 def initial_state(params: Params, layout: Layout) -> State:
-    """Full batteries, fresh data, the UAV with a full battery in the origin corner."""
+    """Return the state before the first slot: full batteries, fresh data, the UAV in the origin corner."""
     return State(
         battery=jnp.asarray(layout.capacity, jnp.float32),
         age=jnp.zeros(layout.capacity.shape, jnp.int32),
@@ -81,22 +81,22 @@ def initial_state(params: Params, layout: Layout) -> State:
     )
 
 
-def slots_to_expiry(params: Params) -> Any:
-    """Slots without service after which fresh data have expired: 11 with the paper's limit of 10."""
+def slots_to_expiry(params: Params) -> Int[Array, "*batch"]:
+    """Return after how many slots without service fresh data expire: 11 with the paper's limit of 10."""
     return jnp.where(params.age_at_limit_fails, params.data_age_limit_slots, params.data_age_limit_slots + 1)
 
 
 def upload_rate(params: Params, slant_distance_m: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Shannon rate of an upload to the UAV, bit/s (paper, equation 4); every served device has the full band."""
+    """Return the Shannon rate of an upload to the UAV, bit/s (paper, equation 4); each served device has the full band."""
     gain = params.reference_gain * jnp.exp(-params.path_loss_exponent * jnp.log(slant_distance_m))
     snr = params.transmit_power_w * gain / params.noise_power_w
     return params.bandwidth_hz * _log1p(snr) / math.log(2.0)
 
 
 def _log1p(x: Float[Array, " n"]) -> Float[Array, " n"]:
-    """``log(1 + x)`` of ``x >= 0``, relative error below 3e-7; XLA's own costs as much as the rest of the slot.
+    """Return ``log(1 + x)`` for ``x >= 0`` with a relative error below 3e-7.
 
-    Small arguments go through the series of ``2 artanh(x / (2 + x))``.
+    XLA's ``log1p`` costs as much as the rest of the slot. Small arguments use the series of ``2 artanh(x / (2 + x))``.
     """
     z = x / (2.0 + x)
     square = z * z
@@ -107,23 +107,27 @@ def _log1p(x: Float[Array, " n"]) -> Float[Array, " n"]:
 def transition(
     params: Params, layout: Layout, state: State, action: Int[ArrayLike, ""], volumes: Num[Array, " n"]
 ) -> tuple[State, Outcome]:
-    """Fly to a device, serve everyone in range, let the others compute, and see who is still alive.
+    """Fly to a device, serve all devices in range, let the others compute, and check for failures.
 
     Args:
         params: scenario parameters.
-        layout: the devices.
-        state: before the slot.
+        layout: the devices, without batch axes (use ``vmap``).
+        state: the state before the slot.
         action: int in ``[0, n)``, the device to visit; staying is allowed. (Out of range is clamped, as JAX indexes.)
-        volumes: ``[n]`` bytes, the task of each device in this slot.
+        volumes: ``[n]`` bytes, each device's task in this slot.
 
     Returns:
-        The state after the slot and its :class:`Outcome`. If the UAV cannot pay for the slot nothing happens in it.
+        The state after the slot and its :class:`Outcome`. If the UAV's battery does not cover the slot, nothing
+        happens in it.
     """
+    n = layout.capacity.shape[-1]
+    chex.assert_shape([layout.capacity, state.battery, state.age, volumes], (n,))
+    chex.assert_rank(action, 0)
     hover_point = layout.position[action]
     t_fly = jnp.linalg.norm(hover_point - state.uav_position) / params.uav_speed_m_s
     ground = layout.position - hover_point
     slant = jnp.sqrt(jnp.sum(ground**2, axis=-1) + params.uav_altitude_m**2)
-    served = (slant <= params.uav_signal_range_m) | (jnp.arange(layout.capacity.shape[0]) == action)
+    served = (slant <= params.uav_signal_range_m) | (jnp.arange(n) == action)
 
     t_upload = 8.0 * volumes / upload_rate(params, slant)
     t_compute = jnp.minimum(volumes / layout.processing_rate, params.slot_cap_s)
@@ -164,14 +168,14 @@ def _outcome(
     drain: Float[Array, " n"],
     empty: Bool[Array, " n"],
 ) -> Outcome:
-    """Check the failures after the slot: an empty battery outranks expired data."""
+    """Check for failures after the slot; an empty battery takes precedence over expired data."""
     expired = starts & (after.age >= slots_to_expiry(params))
     cause = jnp.where(
         starts,
         jnp.where(jnp.any(empty), Cause.BATTERY, jnp.where(jnp.any(expired), Cause.DATA_AGE, Cause.NONE)),
         Cause.UAV,
     )
-    # Mean power over the slot is drain / duration, so the part of the slot a battery lasts is battery / drain.
+    # Mean power over the slot is drain / duration, so a battery lasts battery / drain of the slot.
     lasts = jnp.where(empty, before.battery / jnp.where(empty, drain, 1.0), jnp.inf)
     first = jnp.where(jnp.any(empty), empty & (lasts <= jnp.min(lasts)), expired)
     return Outcome(

@@ -1,4 +1,4 @@
-"""The environment a learner sees: scenarios, observations, and the signatures of gymnax 1.0."""
+"""The environment for reinforcement learning, with the signatures of gymnax 1.0."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,43 +7,46 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from uavmec_jax.env.dynamics import Cause, State, initial_state
 from uavmec_jax.env.layout import Layout
-from uavmec_jax.env.observation import observe_as_paper
+from uavmec_jax.env.observation import observe
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.scenario import Scenario, advance, auto_reset, draw_volumes, is_truncated, make_scenario
 
 
 @dataclass(frozen=True)
 class UavMecEnv:
-    """UAV-assisted edge computing as an environment with the signatures of gymnax 1.0.
+    """UAV-assisted edge computing with the signatures of gymnax 1.0.
 
-    Observation: f32 ``[2n]``, see :func:`observe`. Action: int in ``[0, n)``, the device to visit.
-    Reward: see :mod:`uavmec_jax.env.rewards`. ``params`` is a :class:`Scenario`, batched by ``vmap``.
-    The state is a :class:`State`; ``step`` resets by itself when an episode ends and then reports the true last
-    observation as ``info["final_observation"]``.
+    - Observation: f32 ``[2n]``, see :func:`observe`.
+    - Action: int in ``[0, n)``, the device to visit.
+    - Reward: f32 scalar, see :mod:`uavmec_jax.env.rewards`.
+    - State: a :class:`State`.
+    - ``params``: a :class:`Scenario`; ``vmap`` batches it.
+
+    ``step`` resets automatically when an episode ends; ``info["final_observation"]`` is the observation before the reset.
 
     Attributes:
-        observation_fn: ``(params, layout, state) -> observation``, an array or a pytree; by default the paper's.
-            :func:`um.planning.observe_devices` is the full one.
+        observation_fn: ``(params, layout, state) -> observation``, an array or a pytree. The default is the paper's
+            observation; :func:`um.planning.observe_devices` is the full one.
     """
 
-    observation_fn: Callable[[Params, Layout, State], Any] = observe_as_paper
+    observation_fn: Callable[[Params, Layout, State], Any] = observe
     name: ClassVar[str] = "UavMec"
 
     @property
     def default_params(self) -> Scenario:
-        """The scenario used where none is given: :func:`make_scenario` without arguments."""
+        """The scenario used if none is given: :func:`make_scenario` without arguments."""
         return make_scenario()
 
     def num_actions(self, params: Scenario) -> int:
-        """Number of actions, one per device."""
+        """Return the number of actions, one per device."""
         return params.layout.capacity.shape[-1]
 
     def observation_shape(self, params: Scenario) -> Any:
-        """Shape of an observation; of one that is a pytree, the tree of its leaves' shapes."""
+        """Return the shape of an observation, or, if it is a pytree, the tree of its leaves' shapes."""
         state = jax.eval_shape(initial_state, params.params, params.layout)
         return jax.tree.map(
             lambda leaf: leaf.shape, jax.eval_shape(self.observation_fn, params.params, params.layout, state)
@@ -51,22 +54,21 @@ class UavMecEnv:
 
     @partial(jax.jit, static_argnames=("self",))
     def reset(self, key: PRNGKeyArray, params: Scenario | None = None) -> tuple[Any, State]:
-        """Start an episode: observation and state. Nothing in it is random; volumes are drawn per slot."""
+        """Start an episode and return its observation and state. Nothing is drawn here: volumes are drawn in each slot."""
         del key
         scenario = self.default_params if params is None else params
         state = initial_state(scenario.params, scenario.layout)
-        return self._seen(scenario, state), state
+        return self._observe(scenario, state), state
 
     @partial(jax.jit, static_argnames=("self",))
     def step(
-        self, key: PRNGKeyArray, state: State, action: Any, params: Scenario | None = None
-    ) -> tuple[Any, State, Array, Array, Array, dict[str, Any]]:
+        self, key: PRNGKeyArray, state: State, action: Int[ArrayLike, ""], params: Scenario | None = None
+    ) -> tuple[Any, State, Float[Array, ""], Bool[Array, ""], Bool[Array, ""], dict[str, Any]]:
         """Play one slot with volumes drawn from ``key``.
 
         Returns:
             ``(observation, state, reward, terminated, truncated, info)``; ``info`` holds ``terminated``, ``truncated``,
-            ``final_observation`` ``[2n]``, ``cause`` (:class:`Cause`), ``failed`` ``[n]``, ``served`` ``[n]``,
-            ``duration`` (s), ``first_failure`` ``[n]`` and ``length`` (slots of the episode so far).
+            ``final_observation``, the fields of :class:`Outcome` and ``length``, the slots of the episode so far.
         """
         scenario = self.default_params if params is None else params
         layout = scenario.layout
@@ -74,7 +76,7 @@ class UavMecEnv:
         after, reward, outcome = advance(scenario, state, jnp.asarray(action, jnp.int32), volumes)
         terminated = outcome.cause != Cause.NONE
         truncated = is_truncated(scenario, after, outcome)
-        final_observation = self._seen(scenario, after)
+        final_observation = self._observe(scenario, after)
         next_state = auto_reset(terminated | truncated, scenario, after)
         info = {
             "terminated": terminated,
@@ -87,7 +89,7 @@ class UavMecEnv:
             "first_failure": outcome.first_failure,
             "length": after.slot,
         }
-        return self._seen(scenario, next_state), next_state, reward, terminated, truncated, info
+        return self._observe(scenario, next_state), next_state, reward, terminated, truncated, info
 
-    def _seen(self, scenario: Scenario, state: State) -> Any:
+    def _observe(self, scenario: Scenario, state: State) -> Any:
         return self.observation_fn(scenario.params, scenario.layout, state)

@@ -1,4 +1,4 @@
-"""Hardware of the paper: device types and their standby power (Table 1), active power (Table 2), rates (Table 3)."""
+"""The paper's hardware: device types, their standby power (Table 1), active power (Table 2) and rates (Table 3)."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ TASKS: tuple[str, ...] = ("HAAR", "MMOD", "DNN", "Dlib", "YOLOv3")
 """Computer-vision tasks; an int ``task`` indexes this tuple and the rows of the tables below."""
 
 STANDBY_POWER_W = np.array([2.65, 1.69, 4.87, 2.82, 1.88], np.float32)
-"""Table 1: power drawn all the time, W, ``[types]``."""
+"""Table 1: power drawn at all times, W, ``[types]``."""
 
 ACTIVE_POWER_W = np.array(
     [
@@ -21,7 +21,7 @@ ACTIVE_POWER_W = np.array(
     ],
     np.float32,
 )
-"""Table 2: power drawn on top of standby while computing, W, ``[tasks, types]``."""
+"""Table 2: power drawn in addition to standby while computing, W, ``[tasks, types]``."""
 
 PROCESSING_RATE_BYTES_S = np.array(
     [

@@ -8,11 +8,16 @@ from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 
 
-def observe(layout: Layout, state: State) -> Float[Array, "*b two_n"]:
-    """The paper's observation, ``[..., 2n]`` f32: n battery fractions in [0, 1], then n data ages as plain counts."""
+def observe(params: Params, layout: Layout, state: State) -> Float[Array, "*batch obs_size"]:
+    """Return the paper's observation, ``[..., 2n]`` f32.
+
+    Args:
+        params: not used; every ``observation_fn`` has these arguments.
+        layout: the devices.
+        state: one state, or a batch of states of these devices.
+
+    Returns:
+        n battery fractions in [0, 1], then n data ages in slots.
+    """
+    del params
     return jnp.concatenate([state.battery / layout.capacity, state.age.astype(jnp.float32)], axis=-1)
-
-
-def observe_as_paper(params: Params, layout: Layout, state: State) -> Float[Array, "*b two_n"]:
-    """:func:`observe`, called as every way to see is."""
-    return observe(layout, state)

@@ -1,31 +1,32 @@
-"""The numbers of Table 1 that are the same for every device, and the readings the paper leaves open."""
+"""Simulation parameters: those of Table 1 that all devices share, and switches for what the paper leaves open."""
 
 import math
 from typing import Any
 
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import Array, Float
 
 from uavmec_jax.env.types import Range, Scalar
 
 MAX_DEVICES = 64
-"""Most devices of a scenario."""
+"""Largest number of devices in a scenario."""
 
 
 @struct.dataclass
 class Params:
-    """Simulation parameters (paper, Table 1), SI units; frozen, and a pytree whose leaves may all be traced.
+    """Simulation parameters (paper, Table 1) in SI units: a frozen pytree whose leaves may all be traced.
 
-    The defaults are the paper's. Only ``n_devices`` is static, since it is a shape.
-    A field's metadata are the bounds that a study file is held to (without any: at least 0).
-    The last group holds readings where the paper is ambiguous; ``docs/model.md`` explains each.
+    The defaults are the paper's. Only ``n_devices`` is static, since it is a shape. The metadata of a field hold the
+    bounds that files must respect (at least 0 if there are none). The last group of fields chooses between
+    interpretations where the paper is ambiguous; ``docs/model.md`` explains each.
     """
 
     uav_speed_m_s: Scalar = struct.field(default=5.0, metadata={"gt": 0})
     uav_flying_power_w: Scalar = 150.0
     uav_hovering_power_w: Scalar = struct.field(default=80.0, metadata={"gt": 0})
     uav_signal_range_m: Scalar = struct.field(default=65.0, metadata={"gt": 0})
-    """Longest slant distance (altitude included) at which a device is served."""
+    """Largest slant distance, which includes the altitude, at which a device is served."""
     uav_altitude_m: Scalar = 10.0
     uav_battery_j: Scalar = struct.field(default=1_600_000.0, metadata={"gt": 0})
     n_devices: int = struct.field(pytree_node=False, default=12, metadata={"ge": 2, "le": MAX_DEVICES})
@@ -38,32 +39,32 @@ class Params:
     task_volume_range_bytes: Range = (2e6, 4e6)
     data_age_limit_slots: Scalar = struct.field(default=10, metadata={"ge": 0, "le": 250})
     slot_cap_s: Scalar = struct.field(default=600.0, metadata={"gt": 0})
-    """Longest local processing time; what does not fit is dropped."""
+    """Longest local processing time in a slot; work beyond it is dropped."""
     region_m: Range = (800.0, 800.0)
     result_message_bytes: Scalar = 1000.0
 
     uplink_rate_bit_s: Scalar = struct.field(default=math.inf, metadata={"gt": 0})
-    """Rate at which a connected device that is not served sends its results (not in the paper)."""
+    """Rate at which connected devices that are not served send their results (not in the paper)."""
     flight_power_adds_to_hover: Scalar = False
-    """UAV energy ``fly * t_fly + hover * T`` instead of ``fly * t_fly + hover * (T - t_fly)``."""
+    """Whether a slot of length T costs the UAV ``fly * t_fly + hover * T``, not ``fly * t_fly + hover * (T - t_fly)``."""
     count_unfinished_slot: Scalar = False
-    """Count the slot that the UAV's battery cannot pay for."""
+    """Whether the slot that the UAV's battery does not cover counts."""
     age_at_limit_fails: Scalar = False
-    """Data expire when the age reaches the limit (``>=``) instead of when it passes it (``>``)."""
+    """Whether data expire when their age reaches the limit (``>=``), not when it exceeds it (``>``)."""
     max_slots: Scalar = struct.field(default=1000, metadata={"ge": 1, "le": 1_000_000})
-    """Time limit of an episode (truncation); far beyond what the UAV's battery allows at the paper's settings."""
+    """Time limit of an episode (truncation), far beyond what the UAV's battery allows with the paper's parameters."""
 
     @property
-    def noise_power_w(self) -> Scalar:
+    def noise_power_w(self) -> Float[Array, "*batch"]:
         """Channel noise power, W."""
         return 10.0 ** ((jnp.asarray(self.noise_power_dbm, jnp.float32) - 30.0) / 10.0)
 
     @property
-    def reference_gain(self) -> Scalar:
+    def reference_gain(self) -> Float[Array, "*batch"]:
         """Channel gain at 1 m, a ratio."""
         return 10.0 ** (jnp.asarray(self.reference_gain_db_at_1m, jnp.float32) / 10.0)
 
 
-def leaf_dtype(default: Any) -> Any:
+def leaf_dtype(default: bool | int | float) -> Any:
     """Return the dtype of a traced leaf whose default is a Python number: bool, int32 or float32."""
     return {bool: jnp.bool_, int: jnp.int32}.get(type(default), jnp.float32)

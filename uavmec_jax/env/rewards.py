@@ -1,4 +1,4 @@
-"""Rewards: weight vectors over eight terms; the eleven of Table 6 by name (paper, section 3.2 and Table 6)."""
+"""Rewards: weight vectors over eight terms, the eleven of Table 6 by name (paper, section 3.2 and Table 6)."""
 
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
@@ -15,14 +15,14 @@ from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.types import Scalar
 
 TERMS: tuple[str, ...] = ("A", "U", "M", "O", "log A", "log U", "log M", "log O")
-"""The terms a reward weighs, in the order of a weight vector.
+"""The terms of a reward, in the order of a weight vector.
 
-A: age of the visited device before the visit. U: slots completed after this one. M: lowest battery fraction after the
-slot. O: oldest age before the visit.
+A: data age of the visited device before the visit. U: slots completed, this one included. M: lowest battery fraction
+after the slot. O: oldest data age before the visit.
 """
 
 LOG_GUARDS: tuple[str, ...] = ("clamp", "log1p")
-"""What the logarithms do at zero: ``clamp`` is log(max(x, 1e-6)); ``log1p`` is log(x + 1) for the ages A and O."""
+"""How the logarithms treat zero: ``clamp`` is log(max(x, 1e-6)); ``log1p`` is log(x + 1) for the ages A and O."""
 
 _SMALLEST = 1e-6
 
@@ -45,7 +45,7 @@ def make_weights(terms: Mapping[str, float]) -> np.ndarray:
 
 
 DEFAULT_REWARD = "U+log(A/O)"
-"""The reward the paper found best, the last row of Table 6."""
+"""The reward that the paper found best, the last row of Table 6."""
 
 REWARDS: Mapping[str, np.ndarray] = MappingProxyType(
     {
@@ -70,13 +70,13 @@ class Reward:
     """A reward: linear in the terms, or any function of them.
 
     Attributes:
-        weights: ``[8]`` over :data:`TERMS`.
-        log1p: bool; the guard of the logarithms, see :data:`LOG_GUARDS`.
-        function: ``None``, or what makes a scalar from ``{term: scalar}`` in place of the weights; static.
-        traffic_bonus: added once for a device in the densest traffic when it is visited, less for others, in proportion
-            to their traffic (paper, section 5.1).
-        traffic_penalty: taken off, in the same proportion, for the device that fails first.
-        per_slot: added for every slot that counts; with nothing else, the sum of the rewards is the lifetime.
+        weights: weights of the :data:`TERMS`.
+        log1p: bool, the guard of the logarithms; see :data:`LOG_GUARDS`.
+        function: a function from ``{term: scalar}`` to a scalar that replaces the weighted sum, or ``None``; static.
+        traffic_bonus: added when a device in the densest traffic is visited, proportionally less for a device in
+            lighter traffic (paper, section 5.1).
+        traffic_penalty: subtracted, in the same proportion, for the device that fails first.
+        per_slot: added for every slot that counts; alone, it makes the sum of the rewards the lifetime.
     """
 
     weights: Float[Array, "*batch 8"]
@@ -95,18 +95,18 @@ def make_reward(
     traffic_penalty: float = 0.0,
     per_slot: float = 0.0,
 ) -> Reward:
-    """Return a :class:`Reward` from a name of Table 6, from weights of one's own, or from a function.
+    """Make a :class:`Reward` from a name of Table 6, from custom weights, or from a function.
 
     Args:
-        reward: ``"U+log(A/O)"``; or ``{"U": 1.0, "log A": 1.0}``; or a function of a mapping from :data:`TERMS` to
-            scalars that returns a scalar and can be traced, e.g. ``lambda terms: terms["U"] * terms["M"]``.
+        reward: a name such as ``"U+log(A/O)"``; weights such as ``{"U": 1.0, "log A": 1.0}``; or a traceable function
+            from ``{term: scalar}`` to a scalar, such as ``lambda terms: terms["U"] * terms["M"]``.
         guard: one of :data:`LOG_GUARDS`.
-        traffic_bonus: see :class:`Reward`; has an effect where the layout knows its traffic.
+        traffic_bonus: see :class:`Reward`; it has an effect in layouts with traffic.
         traffic_penalty: likewise.
         per_slot: added for every slot that counts; ``make_reward({}, per_slot=1.0)`` is the lifetime.
 
     Raises:
-        ValueError: unknown name, term or guard; or the function does not return a scalar.
+        ValueError: the name, a term or the guard is unknown, or the function does not return a scalar.
     """
     if guard not in LOG_GUARDS:
         raise ValueError(f"unknown log guard {guard!r}; guards are {', '.join(LOG_GUARDS)}")
@@ -129,25 +129,26 @@ def make_reward(
 
 
 def _check_function(function: Callable[[Mapping[str, Any]], Any]) -> None:
+    """Check that a reward function asks for known terms only and returns a scalar."""
     scalar = jax.ShapeDtypeStruct((), jnp.float32)
     try:
-        made = jax.eval_shape(lambda terms: jnp.asarray(function(terms)), dict.fromkeys(TERMS, scalar))
+        result = jax.eval_shape(lambda terms: jnp.asarray(function(terms)), dict.fromkeys(TERMS, scalar))
     except KeyError as error:
         raise ValueError(f"the reward function asks for the term {error}; terms are {', '.join(TERMS)}") from None
-    if made.shape != ():
-        raise ValueError(f"the reward function returns an array of shape {made.shape}; it should return a scalar")
+    if result.shape != ():
+        raise ValueError(f"the reward function returns an array of shape {result.shape}; it should return a scalar")
 
 
 def needs_guard(reward: str | Mapping[str, float]) -> bool:
-    """Whether the guard makes a difference: it does to ``log A`` and ``log O`` alone."""
+    """Return whether the guard makes a difference to a reward: only ``log A`` and ``log O`` depend on it."""
     weights = REWARDS[reward] if isinstance(reward, str) else make_weights(reward)
     return bool(weights[TERMS.index("log A")] or weights[TERMS.index("log O")])
 
 
 def reward_terms(
-    layout: Layout, before: State, action: Int[ArrayLike, ""], after: State, log1p: Any = False
+    layout: Layout, before: State, action: Int[ArrayLike, ""], after: State, log1p: Scalar = False
 ) -> Float[Array, "8"]:
-    """The eight :data:`TERMS` of one slot, given the states around it."""
+    """Return the eight :data:`TERMS` of one slot from the states before and after it."""
     visited_age = before.age[action].astype(jnp.float32)
     oldest_age = jnp.max(before.age).astype(jnp.float32)
     slots = after.slot.astype(jnp.float32)
@@ -161,7 +162,7 @@ def reward_terms(
 def reward_of(
     reward: Reward, layout: Layout, before: State, action: Int[ArrayLike, ""], after: State
 ) -> Float[Array, ""]:
-    """The scalar reward of one slot."""
+    """Return the reward of one slot, without traffic."""
     terms = reward_terms(layout, before, action, after, reward.log1p)
     survival = reward.per_slot * (after.slot - before.slot)
     if reward.function is not None:
@@ -172,12 +173,13 @@ def reward_of(
 def traffic_reward(
     reward: Reward, layout: Layout, before: State, action: Int[ArrayLike, ""], outcome: Outcome
 ) -> Float[Array, ""]:
-    """What traffic adds to the reward of one slot; 0 where nobody knows the traffic.
+    """Return what traffic adds to the reward of one slot; 0 for a layout without traffic.
 
-    ``traffic_bonus * w[action] - traffic_penalty * sum(first_failure * w)`` with the weights ``w`` when the slot begins.
+    It is ``traffic_bonus * w[action] - traffic_penalty * sum(first_failure * w)``, where ``w`` are the devices' traffic
+    weights when the slot begins.
     """
     if layout.traffic is None:
         return jnp.zeros(())
     weight = layout.traffic.at(before.elapsed)
-    lost = jnp.dot(outcome.first_failure, weight)
-    return jnp.asarray(reward.traffic_bonus * weight[action] - reward.traffic_penalty * lost, jnp.float32)
+    failed_weight = jnp.dot(outcome.first_failure, weight)
+    return jnp.asarray(reward.traffic_bonus * weight[action] - reward.traffic_penalty * failed_weight, jnp.float32)

@@ -1,4 +1,4 @@
-"""Scenarios, and one slot of one with its reward."""
+"""Scenarios, and one slot of a scenario with its reward."""
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,13 @@ from uavmec_jax.env.rewards import Reward, make_reward, reward_of, traffic_rewar
 
 @struct.dataclass
 class Scenario:
-    """Everything that makes one problem: the ``params`` argument of :class:`UavMecEnv`. Batched by ``vmap``."""
+    """A problem instance: the ``params`` argument of :class:`UavMecEnv`. ``vmap`` batches it.
+
+    Attributes:
+        params: the simulation parameters.
+        layout: the devices.
+        reward: what a policy is rewarded for.
+    """
 
     params: Params
     layout: Layout
@@ -21,16 +27,22 @@ class Scenario:
 
 
 def make_scenario(layout: Layout | None = None, params: Params | None = None, reward: Reward | None = None) -> Scenario:
-    """A scenario from its parts; by default a layout of seed 0 with 8 powered and 8 connected devices."""
+    """Return a scenario made of the given parts.
+
+    Args:
+        layout: by default a random layout in which two thirds of the devices have power and two thirds communication.
+        params: by default those of the paper.
+        reward: by default the one that the paper found best.
+    """
     params = Params() if params is None else params
     if layout is None:
-        share = (2 * params.n_devices) // 3
-        layout = sample_layout(jax.random.key(0), params, share, share)
+        count = (2 * params.n_devices) // 3
+        layout = sample_layout(jax.random.key(0), params, count, count)
     return Scenario(params=params, layout=layout, reward=make_reward() if reward is None else reward)
 
 
 def draw_volumes(params: Params, uniform: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Task volumes in bytes from uniform numbers in [0, 1)."""
+    """Turn uniform random numbers in [0, 1) into task volumes in bytes."""
     low, high = params.task_volume_range_bytes
     return low + uniform * (high - low)
 
@@ -38,20 +50,20 @@ def draw_volumes(params: Params, uniform: Float[Array, "*shape"]) -> Float[Array
 def advance(
     scenario: Scenario, state: State, action: Int[ArrayLike, ""], volumes: Float[Array, " n"]
 ) -> tuple[State, Float[Array, ""], Outcome]:
-    """One slot with explicit volumes and no reset: next state, reward, outcome."""
+    """Play one slot with explicit volumes, without a reset, and return the next state, the reward and the outcome."""
     after, outcome = transition(scenario.params, scenario.layout, state, action, volumes)
     reward = reward_of(scenario.reward, scenario.layout, state, action, after)
-    if scenario.layout.traffic is not None:  # other towns keep the bits and the speed that they have
+    if scenario.layout.traffic is not None:  # known when tracing: other layouts do not pay for it
         reward += traffic_reward(scenario.reward, scenario.layout, state, action, outcome)
     return after, reward, outcome
 
 
-def is_truncated(scenario: Scenario, state: State, outcome: Outcome) -> Array:
-    """Whether the time limit, and nothing else, ends the episode here."""
+def is_truncated(scenario: Scenario, state: State, outcome: Outcome) -> Bool[Array, ""]:
+    """Return whether the time limit, and no failure, ends the episode in this state."""
     return (outcome.cause == Cause.NONE) & (state.slot >= scenario.params.max_slots)
 
 
 def auto_reset(ended: Bool[Array, ""], scenario: Scenario, state: State) -> State:
-    """The state an episode goes on from: a fresh one where it has ended."""
+    """Return the initial state if the episode has ended, else ``state``."""
     fresh = initial_state(scenario.params, scenario.layout)
     return jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, state)

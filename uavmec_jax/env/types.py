@@ -1,9 +1,9 @@
-"""Types of pytree fields. Any leaf may have batch axes in front, ``*batch``, put there by ``vmap``."""
+"""Types of pytree fields. ``vmap`` may put batch axes, ``*batch``, in front of the axes of any leaf."""
 
 from jaxtyping import Array, Bool, Num
 
 Scalar = bool | int | float | Num[Array, "*batch"] | Bool[Array, "*batch"]
-"""A Python number, or an array: ``[]`` for one scenario, ``[B]`` for a batch."""
+"""A Python number or an array: ``[]`` for one scenario, ``[B]`` for a batch."""
 
 Range = tuple[Scalar, Scalar]
 """``(low, high)``."""

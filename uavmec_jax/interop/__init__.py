@@ -1,6 +1,6 @@
-"""The environment for other people's learners; importing this registers ``UavMec-v0`` with Gymnasium.
+"""The environment for libraries that use Gymnasium or gymnax; importing this registers ``UavMec-v0`` with Gymnasium.
 
-``gymnasium.make("uavmec_jax.interop:UavMec-v0")`` does both at once.
+``gymnasium.make("uavmec_jax.interop:UavMec-v0")`` imports and makes it at once.
 """
 
 import gymnasium

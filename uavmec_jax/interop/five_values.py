@@ -1,10 +1,10 @@
-"""The environment for libraries that still speak the step of gymnax 0.0.9: five values, one ``done``."""
+"""The environment for libraries that still expect the step of gymnax 0.0.9: five values, one ``done``."""
 
 from typing import Any
 
-import jax
+import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from uavmec_jax.env.dynamics import State
 from uavmec_jax.env.environment import UavMecEnv
@@ -13,15 +13,15 @@ from uavmec_jax.env.scenario import Scenario, make_scenario
 
 @struct.dataclass
 class FiveValueParams:
-    """What such libraries look for in an environment's parameters.
+    """Environment parameters with the attributes that such libraries read.
 
     Attributes:
-        scenario: what is played.
-        max_steps_in_episode: int, as an evaluation counts.
+        scenario: the scenario that is played.
+        max_steps_in_episode: length to which such libraries cut their evaluation episodes; static.
     """
 
     scenario: Scenario
-    max_steps_in_episode: Any = struct.field(pytree_node=False, default=1000)
+    max_steps_in_episode: int = struct.field(pytree_node=False, default=1000)
 
 
 class FiveValueEnv:
@@ -41,27 +41,27 @@ class FiveValueEnv:
         """The scenario of :func:`um.make_scenario`."""
         return FiveValueParams(scenario=make_scenario())
 
-    def reset(self, key: PRNGKeyArray, params: FiveValueParams | None = None) -> tuple[Array, State]:
-        """Start an episode."""
+    def reset(self, key: PRNGKeyArray, params: FiveValueParams | None = None) -> tuple[Float[Array, " two_n"], State]:
+        """Start an episode; return the observation ``[2n]`` and the state."""
         return self._env.reset(key, (params or self.default_params).scenario)
 
     def step(
-        self, key: PRNGKeyArray, state: State, action: Any, params: FiveValueParams | None = None
-    ) -> tuple[Array, State, Array, Array, dict[str, Array]]:
-        """Play one slot."""
+        self, key: PRNGKeyArray, state: State, action: Int[ArrayLike, ""], params: FiveValueParams | None = None
+    ) -> tuple[Float[Array, " two_n"], State, Float[Array, ""], Bool[Array, ""], dict[str, Array]]:
+        """Play one slot, with an automatic reset at the end of an episode."""
         scenario = (params or self.default_params).scenario
         observation, state, reward, terminated, truncated, info = self._env.step(key, state, action, scenario)
         return observation, state, reward, terminated | truncated, info | {"discount": 1.0 - terminated}
 
     def observation_space(self, params: FiveValueParams) -> Any:
-        """gymnax's ``Box``."""
-        from gymnax.environments import spaces
+        """Return gymnax's ``Box`` from 0 to the data age limit + 1."""
+        from gymnax.environments import spaces  # gymnax is not a dependency; whoever asks for its spaces has it
 
-        oldest = params.scenario.params.data_age_limit_slots + 1.0
-        return spaces.Box(0.0, oldest, self._env.observation_shape(params.scenario), jax.numpy.float32)
+        max_age = params.scenario.params.data_age_limit_slots + 1.0
+        return spaces.Box(0.0, max_age, self._env.observation_shape(params.scenario), jnp.float32)
 
     def action_space(self, params: FiveValueParams | None = None) -> Any:
-        """gymnax's ``Discrete``."""
+        """Return gymnax's ``Discrete``: the device to visit."""
         from gymnax.environments import spaces
 
         return spaces.Discrete(self._env.num_actions((params or self.default_params).scenario))

@@ -3,29 +3,31 @@
 from functools import partial
 from typing import Any
 
+import chex
 import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from uavmec_jax.env.dynamics import Cause, State
 from uavmec_jax.env.environment import UavMecEnv
 from uavmec_jax.env.layout import sample_layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.scenario import Scenario, make_scenario
-from uavmec_jax.interop.gymnasium_env import spaces
+from uavmec_jax.interop.gymnasium_env import make_spaces
 
 _CAUSES = np.array([cause.name.lower() for cause in Cause])
 
 
 class UavMecVectorEnv(VectorEnv):
-    """``N`` layouts stepped together; an episode that ends is restarted in the same step.
+    """``N`` scenarios stepped together; an episode that ends is reset in the same step.
 
     ``info`` holds arrays over the environments: ``cause`` ``[N]``, ``failed`` and ``served`` ``[N, n]`` bool,
-    ``first_failure`` ``[N, n]``, ``duration`` and ``length`` ``[N]``; and where episodes ended ``final_obs`` and
-    ``final_info``, with the mask ``_final_obs``, as Gymnasium's own vector environments have them.
+    ``first_failure`` ``[N, n]``, ``duration`` and ``length`` ``[N]``. Where episodes ended, it also holds ``final_obs`` and
+    ``final_info`` with the mask ``_final_obs``, as in Gymnasium's own vector environments.
     """
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
@@ -35,48 +37,62 @@ class UavMecVectorEnv(VectorEnv):
 
         Args:
             num_envs: ``N``.
-            scenario: one for all environments, or one each (leaves ``[N, ...]``); by default the random layouts of the
-                keys 0 to N - 1 with 8 powered and 8 connected devices.
+            scenario: one for all environments, or one each (leaves ``[N, ...]``); by default random layouts with 8 powered
+                and 8 connected devices, drawn with the keys 0 to N - 1.
 
         Raises:
-            ValueError: a batch of scenarios of another size.
+            ValueError: the batch of scenarios has another size.
         """
         self.num_envs = num_envs
-        self._scenario = _batched(num_envs, scenario)
-        self.single_observation_space, self.single_action_space = spaces(self._scenario)
+        self._scenarios = _batch(num_envs, scenario)
+        self.single_observation_space, self.single_action_space = make_spaces(self._scenarios)
         self.observation_space: gymnasium.Space = batch_space(self.single_observation_space, num_envs)
         self.action_space: gymnasium.Space = batch_space(self.single_action_space, num_envs)
         self._env = UavMecEnv()
         self._state: State | None = None
         self._key, self._steps = jax.random.key(0), 0
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict | None = None
+    ) -> tuple[Float[np.ndarray, "N two_n"], dict[str, Any]]:
         """Start an episode in every environment; ``seed`` seeds the task volumes of all."""
         super().reset(seed=seed, options=options)
         if seed is not None or self._state is None:
             self._key, self._steps = jax.random.key(int(self.np_random.integers(2**32, dtype=np.uint32))), 0
-        observation, self._state = _reset(self._env, self._scenario)
+        observation, self._state = _reset(self._env, self._scenarios)
         return np.asarray(observation), {}
 
-    def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """One slot in every environment; ``actions`` is ``[N]``."""
+    def step(
+        self, actions: Any
+    ) -> tuple[
+        Float[np.ndarray, "N two_n"],
+        Float[np.ndarray, " N"],
+        Bool[np.ndarray, " N"],
+        Bool[np.ndarray, " N"],
+        dict[str, Any],
+    ]:
+        """Play one slot in every environment; ``actions`` is ``[N]``."""
         actions = jnp.asarray(actions, jnp.int32)
-        stepped = _step(self._env, self._scenario, self._key, np.uint32(self._steps), self._state, actions)
-        (observation, self._state, *told), self._steps = stepped, self._steps + 1
-        observation, (reward, terminated, truncated, info) = jax.device_get((observation, told))
-        final = info.pop("final_observation")
+        observation, self._state, *results = _step(
+            self._env, self._scenarios, self._key, np.uint32(self._steps), self._state, actions
+        )
+        self._steps += 1
+        observation, (reward, terminated, truncated, info) = jax.device_get((observation, results))
+        final_observation = info.pop("final_observation")
         ended = info.pop("terminated") | info.pop("truncated")
         info["cause"] = _CAUSES[info["cause"]]
         if ended.any():
-            last = np.full(self.num_envs, None, dtype=object)
-            for place in np.flatnonzero(ended):
-                last[place] = final[place]
-            names = {f"_{name}": ended for name in info}
-            info |= {"final_obs": last, "_final_obs": ended, "final_info": dict(info) | names, "_final_info": ended}
+            final_obs = np.full(self.num_envs, None, dtype=object)
+            for index in np.flatnonzero(ended):
+                final_obs[index] = final_observation[index]
+            masks = {f"_{name}": ended for name in info}
+            final_info = dict(info) | masks
+            info |= {"final_obs": final_obs, "_final_obs": ended, "final_info": final_info, "_final_info": ended}
         return observation, reward, terminated, truncated, info
 
 
-def _batched(num_envs: int, scenario: Scenario | None) -> Scenario:
+def _batch(num_envs: int, scenario: Scenario | None) -> Scenario:
+    """Return ``num_envs`` scenarios, leaves ``[num_envs, ...]``."""
     if scenario is None:
         params = Params()
         keys = jax.vmap(jax.random.key)(jnp.arange(num_envs))
@@ -89,11 +105,15 @@ def _batched(num_envs: int, scenario: Scenario | None) -> Scenario:
 
 
 @partial(jax.jit, static_argnums=0)
-def _reset(env: UavMecEnv, scenario: Scenario) -> tuple[Any, State]:
-    return jax.vmap(lambda scenario: env.reset(jax.random.key(0), scenario))(scenario)
+def _reset(env: UavMecEnv, scenarios: Scenario) -> tuple[Float[Array, "N two_n"], State]:
+    return jax.vmap(lambda scenario: env.reset(jax.random.key(0), scenario))(scenarios)
 
 
 @partial(jax.jit, static_argnums=0)
-def _step(env: UavMecEnv, scenario: Scenario, key: Any, number: Any, state: State, actions: Any) -> Any:
+def _step(
+    env: UavMecEnv, scenarios: Scenario, key: Key[Array, ""], number: Any, state: State, actions: Int[Array, " N"]
+) -> Any:
+    """Play step ``number`` of every environment."""
+    chex.assert_equal_shape((actions, state.slot))
     keys = jax.random.split(jax.random.fold_in(key, number), actions.shape[0])
-    return jax.vmap(env.step)(keys, state, actions, scenario)
+    return jax.vmap(env.step)(keys, state, actions, scenarios)

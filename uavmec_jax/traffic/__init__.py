@@ -1,8 +1,8 @@
-"""Evacuation traffic: which devices matter.
+"""Evacuation traffic: how much of it each device sees.
 
-SUMO simulates a town's evacuation once (`uavmec traffic build`) and leaves a small file, an :class:`Evacuation`; training,
-evaluation and figures read that and never start SUMO. Files from outside are checked before anything of SUMO sees
-them, a user's SUMO configuration is never run, and all that SUMO writes goes into a folder that does not outlive us.
+SUMO simulates the evacuation of a place once (`uavmec traffic build`) and leaves a small file, an :class:`Evacuation`.
+Training, evaluation and figures read that file and never start SUMO. Files from outside are checked before SUMO reads them, a
+user's SUMO configuration is never run, and everything SUMO writes goes into a temporary folder.
 """
 
 import lazy_loader

@@ -1,6 +1,6 @@
-"""Maps and networks from outside: checked while they are copied to where SUMO may read them.
+"""Maps and road networks from outside, checked while they are copied to where SUMO may read them.
 
-SUMO's own readers load negative speeds, unknown elements and included files without a word. What is refused here never
+SUMO's own readers silently accept negative speeds, unknown elements and included files. A file that is refused here never
 reaches them.
 """
 
@@ -21,10 +21,10 @@ from defusedxml import DefusedXmlException
 
 from uavmec_jax.errors import TrafficError
 
-MOST_BYTES = 4 * 2**30
-"""Longest file, decompressed; a compressed file of a few kilobytes can claim any length."""
+MAX_BYTES = 4 * 2**30
+"""Longest file, decompressed: a compressed file of a few kilobytes can expand to any length."""
 
-_KNOWN: Mapping[str, tuple[str, ...]] = {
+_ELEMENTS: Mapping[str, tuple[str, ...]] = {
     "osm": ("osm", "bounds", "note", "meta", "remark", "node", "way", "relation", "tag", "nd", "member"),
     "net": (
         *("net", "location", "type", "restriction", "edge", "lane", "stopOffset", "neigh", "param", "tlLogic", "phase"),
@@ -34,9 +34,9 @@ _KNOWN: Mapping[str, tuple[str, ...]] = {
     "edges": ("edges", "edge", "lane", "param", "split", "neigh", "roundabout"),
     "types": ("types", "type", "restriction", "laneType", "param"),
 }
-"""Root element of a kind of file -> the elements it may hold."""
+"""Kind of file, which is the name of its root element -> the elements it may hold."""
 
-_SPOKEN = {
+_DESCRIPTIONS = {
     "osm": "an OpenStreetMap extract",
     "net": "a SUMO network",
     "nodes": "a file of nodes",
@@ -49,11 +49,11 @@ _POSITIVE = ("speed", "length", "numLanes", "width")
 
 @dataclass
 class Contents:
-    """What a file was found to hold.
+    """Summary of a checked file.
 
     Attributes:
-        counts: element -> how many.
-        west, south, east, north: degrees, of the nodes of an OpenStreetMap extract.
+        counts: element -> number of times it occurs.
+        west, south, east, north: degrees, extent of the nodes of an OpenStreetMap extract.
     """
 
     counts: Counter[str] = field(default_factory=Counter)
@@ -63,26 +63,31 @@ class Contents:
     north: float = -math.inf
 
     def overlaps(self, bbox: tuple[float, float, float, float]) -> bool:
-        """Whether a box ``(west, south, east, north)`` holds any of it."""
+        """Return whether a box ``(west, south, east, north)`` overlaps the extent."""
         return bbox[0] <= self.east and bbox[2] >= self.west and bbox[1] <= self.north and bbox[3] >= self.south
+
+    def extend(self, lon: float, lat: float) -> None:
+        """Extend the extent to a point."""
+        self.west, self.east = min(self.west, lon), max(self.east, lon)
+        self.south, self.north = min(self.south, lat), max(self.north, lat)
 
 
 def checked_copy(source: Path, target: Path, kind: str) -> Contents:
-    """Copy a file from outside, decompressed, checking it on the way.
+    """Copy a file from outside, decompressed, and check it on the way.
 
     Args:
-        source: plain, gzip or bzip2, whatever it is called.
+        source: plain, gzip or bzip2; its name does not matter.
         target: where SUMO may read it.
         kind: ``"osm"``, ``"net"``, ``"nodes"``, ``"edges"`` or ``"types"``.
 
     Raises:
-        TrafficError: it is not there, not XML, truncated, too long, something else, declares a DTD or entities, or holds
-            unknown elements or numbers that make no sense; one line.
+        TrafficError: the file does not exist, is not XML, is truncated, too long or of another kind, declares a DTD or
+            entities, or holds unknown elements or numbers out of range; one line.
     """
-    handler = _Checks(kind)
+    handler = _CheckingHandler(kind)
     try:
         with source.open("rb") as raw, target.open("wb") as copy:
-            defusedxml.sax.parse(_Tee(_decompressed(raw), copy), handler, forbid_dtd=True)
+            defusedxml.sax.parse(_Tee(_decompress(raw), copy), handler, forbid_dtd=True)
     except DefusedXmlException:
         raise TrafficError(f"{source}: declares a DTD or entities, which are refused; export it without them") from None
     except SAXParseException as error:
@@ -100,10 +105,10 @@ def checked_copy(source: Path, target: Path, kind: str) -> Contents:
 
 
 class _RefusedError(Exception):
-    """A file holds what it should not."""
+    """A file holds something that is not allowed."""
 
 
-def _decompressed(raw: IO[bytes]) -> Any:
+def _decompress(raw: IO[bytes]) -> Any:
     magic = raw.read(3)
     raw.seek(0)
     if magic[:2] == b"\x1f\x8b":
@@ -112,7 +117,7 @@ def _decompressed(raw: IO[bytes]) -> Any:
 
 
 class _Tee:
-    """Reads a file and writes what was read to another one."""
+    """A file whose contents are written to another file as they are read."""
 
     def __init__(self, source: Any, copy: IO[bytes]):
         self._source, self._copy, self._bytes = source, copy, 0
@@ -120,32 +125,32 @@ class _Tee:
     def read(self, size: int = -1) -> bytes:
         chunk: bytes = self._source.read(size)
         self._bytes += len(chunk)
-        if self._bytes > MOST_BYTES:
-            raise _RefusedError(f"is longer than {MOST_BYTES / 2**30:g} GiB; cut it to the town first")
+        if self._bytes > MAX_BYTES:
+            raise _RefusedError(f"is longer than {MAX_BYTES / 2**30:g} GiB; cut out the area that you need first")
         self._copy.write(chunk)
         return chunk
 
     def close(self) -> None:
-        """The files are closed by whoever opened them."""
+        """Do nothing: :func:`checked_copy` closes the files that it opened."""
 
 
-class _Checks(ContentHandler):
-    """Root, elements and numbers."""
+class _CheckingHandler(ContentHandler):
+    """Checks the root element, the names of the elements, and numbers."""
 
     def __init__(self, kind: str):
         super().__init__()
         self._kind = kind
         self.contents = Contents()
 
-    def startElement(self, name: str, attrs: Any) -> None:  # noqa: N802  (the name SAX calls)
+    def startElement(self, name: str, attrs: Any) -> None:  # noqa: N802  (SAX's name)
         if not self.contents.counts:
             self._check_root(name)
-        elif name not in _KNOWN[self._kind]:
-            raise _RefusedError(f"holds <{name}>, which is not an element of {_SPOKEN[self._kind]}")
+        elif name not in _ELEMENTS[self._kind]:
+            raise _RefusedError(f"holds <{name}>, which is not an element of {_DESCRIPTIONS[self._kind]}")
         self.contents.counts[name] += 1
         if self._kind == "osm":
             if name == "node":
-                self._place(attrs)
+                self._add_node(attrs)
             return
         for quantity in _POSITIVE:
             if quantity in attrs:
@@ -153,9 +158,9 @@ class _Checks(ContentHandler):
 
     def _check_root(self, name: str) -> None:
         if name in _CONFIGURATIONS:
-            raise _RefusedError(f"is a SUMO configuration, which is never run; give {_SPOKEN[self._kind]}")
+            raise _RefusedError(f"is a SUMO configuration, which is never run; give {_DESCRIPTIONS[self._kind]}")
         if name != self._kind:
-            raise _RefusedError(f"begins with <{name}>; {_SPOKEN[self._kind]} begins with <{self._kind}>")
+            raise _RefusedError(f"begins with <{name}>; {_DESCRIPTIONS[self._kind]} begins with <{self._kind}>")
 
     def _check_number(self, name: str, attrs: Any, quantity: str) -> None:
         try:
@@ -163,18 +168,16 @@ class _Checks(ContentHandler):
         except ValueError:
             value = math.nan
         if value == -1 and quantity in ("width", "length"):
-            return  # SUMO's word for "not given"
+            return  # SUMO writes -1 for "not given"
         if not 0 < value < 1e7:
-            who = f"{name} {attrs['id']!r}" if "id" in attrs else f"a {name}"
-            raise _RefusedError(f"{quantity} of {who} is {attrs[quantity]!r}; it should be a number above 0")
+            element = f"{name} {attrs['id']!r}" if "id" in attrs else f"a {name}"
+            raise _RefusedError(f"{quantity} of {element} is {attrs[quantity]!r}; it should be a number above 0")
 
-    def _place(self, attrs: Any) -> None:
+    def _add_node(self, attrs: Any) -> None:
         try:
             lon, lat = float(attrs["lon"]), float(attrs["lat"])
         except (KeyError, ValueError):
             raise _RefusedError(f"node {attrs.get('id', '?')} has no lon and lat in degrees") from None
         if not (abs(lon) <= 180 and abs(lat) <= 90):
             raise _RefusedError(f"node {attrs.get('id', '?')} lies at lon {lon}, lat {lat}, which is not on the Earth")
-        found = self.contents
-        found.west, found.east = min(found.west, lon), max(found.east, lon)
-        found.south, found.north = min(found.south, lat), max(found.north, lat)
+        self.contents.extend(lon, lat)

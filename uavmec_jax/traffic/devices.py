@@ -1,6 +1,7 @@
-"""Where devices stand: as a file says, or at junctions far from each other, a share of them on the corridors."""
+"""Place devices: where a file says, or at junctions far apart from each other, a share of them on busy corridors."""
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from uavmec_jax.errors import TrafficError
 from uavmec_jax.files.validation import suggest
@@ -10,48 +11,54 @@ from uavmec_jax.traffic.place import Place, Placement, Site
 from uavmec_jax.traffic.weights import density_near
 
 _CORRIDOR_QUANTILE = 0.8
+"""Junctions whose traffic density is at or above this quantile lie on a corridor."""
 
 
 def place_devices(
-    place: Place, network: RoadNetwork, routes: Routes, density: np.ndarray
-) -> tuple[list[str], np.ndarray]:
-    """Names, and positions ``[n, 2]`` m in the network.
+    place: Place, network: RoadNetwork, routes: Routes, density: Float[np.ndarray, " R"]
+) -> tuple[list[str], Float[np.ndarray, "n 2"]]:
+    """Place the devices.
 
     Args:
         place: its sites, or how to choose them.
         network: the junctions.
-        routes: the devices are placed around the middle of the origins.
-        density: ``[R]`` vehicles per km and lane, which say what a corridor is.
+        routes: the devices are placed around the centre of the origins.
+        density: ``[R]`` vehicles per km and lane, which tell corridors from other roads.
+
+    Returns:
+        Names, and positions ``[n, 2]`` m in the network.
 
     Raises:
         TrafficError: see :func:`check_devices`.
     """
     if place.device:
-        return [site.name for site in place.device], np.array([_of(site, network, place.name) for site in place.device])
-    chosen = _chosen(place.devices, network, _inside(place, network, routes), density)
-    return _named(chosen, network), np.array([network.junctions[junction] for junction in chosen])
+        positions = [_site_position(site, network, place.name) for site in place.device]
+        return [site.name for site in place.device], np.array(positions, float)
+    chosen = _choose_junctions(place.devices, network, _nearby_junctions(place, network, routes), density)
+    return _junction_names(chosen, network), np.array([network.junctions[junction] for junction in chosen], float)
 
 
 def check_devices(place: Place, network: RoadNetwork, routes: Routes) -> None:
-    """Refuse before anything is simulated what :func:`place_devices` could not do.
+    """Check, before anything is simulated, that :func:`place_devices` can place the devices.
 
     Raises:
-        TrafficError: a junction does not exist, or there are fewer of them than devices.
+        TrafficError: a junction does not exist, or there are fewer junctions than devices.
     """
     if not place.device:
-        _inside(place, network, routes)
+        _nearby_junctions(place, network, routes)
     for site in place.device:
-        _of(site, network, place.name)
+        _site_position(site, network, place.name)
 
 
-def _named(junctions: list[str], network: RoadNetwork) -> list[str]:
-    """A name for each junction: the streets that meet there, with its id where two have the same; or the id."""
+def _junction_names(junctions: list[str], network: RoadNetwork) -> list[str]:
+    """Name each junction by the streets that meet there, with its id where two names are equal; or by its id."""
     streets = [" and ".join(network.streets_at(junction)[:2]) or junction for junction in junctions]
-    twice = {name for name in streets if streets.count(name) > 1}
-    return [f"{name} ({own})" if name in twice else name for name, own in zip(streets, junctions, strict=True)]
+    repeated = {name for name in streets if streets.count(name) > 1}
+    return [f"{name} ({id_})" if name in repeated else name for name, id_ in zip(streets, junctions, strict=True)]
 
 
-def _of(site: Site, network: RoadNetwork, name: str) -> tuple[float, float]:
+def _site_position(site: Site, network: RoadNetwork, name: str) -> tuple[float, float]:
+    """Return the position of a site in metres; ``name`` is that of the place, for error messages."""
     if site.junction is None:
         assert site.x_m is not None
         assert site.y_m is not None
@@ -62,42 +69,50 @@ def _of(site: Site, network: RoadNetwork, name: str) -> tuple[float, float]:
     return network.junctions[site.junction]
 
 
-def _inside(place: Place, network: RoadNetwork, routes: Routes) -> np.ndarray:
-    """Junctions, by their place in the network, within ``span_m`` around where people live on average."""
-    middle = routes.origin_share @ np.array([road.shape.mean(axis=0) for road in routes.origins])
+def _nearby_junctions(place: Place, network: RoadNetwork, routes: Routes) -> Int[np.ndarray, " J"]:
+    """Return the indices of the junctions in a square of side ``span_m`` around the mean position of the origins."""
+    centre = routes.origin_share @ np.array([road.shape.mean(axis=0) for road in routes.origins])
     position = np.array(list(network.junctions.values()))
     count, span = place.devices.count, place.devices.span_m
-    inside = np.flatnonzero(np.abs(position - middle).max(axis=1) <= span / 2)
-    if len(inside) < count:
+    nearby = np.flatnonzero(np.abs(position - centre).max(axis=1) <= span / 2)
+    if len(nearby) < count:
         raise TrafficError(
-            f"{place.name}: {count} devices, but {len(inside)} junctions in the {span:g} m around where people live "
+            f"{place.name}: {count} devices, but {len(nearby)} junctions in the {span:g} m around where people live "
             f"({len(position)} in all); give fewer devices.count or a larger devices.span_m"
         )
-    return inside
+    return nearby
 
 
-def _chosen(placement: Placement, network: RoadNetwork, inside: np.ndarray, density: np.ndarray) -> list[str]:
-    ids, position = list(network.junctions), np.array(list(network.junctions.values()))
-    near = density_near(position[inside], network.shapes, network.lanes, density, placement.radius_m)
-    dense = inside[near >= np.quantile(near, _CORRIDOR_QUANTILE)]
-    calm = inside[near <= np.median(near)]
-    on_corridors = min(round(placement.corridor_share * placement.count), len(dense))
-    taken = farthest_points(position, dense, on_corridors, [])
+def _choose_junctions(
+    placement: Placement, network: RoadNetwork, nearby: Int[np.ndarray, " J"], density: Float[np.ndarray, " R"]
+) -> list[str]:
+    """Choose junctions: some on the corridors, the others among those with less than median traffic."""
+    ids, position = list(network.junctions), np.array(list(network.junctions.values()), float)
+    near = density_near(position[nearby], network.shapes, network.lanes, density, placement.radius_m)
+    corridors = nearby[near >= np.quantile(near, _CORRIDOR_QUANTILE)]
+    calm = nearby[near <= np.median(near)]
+    on_corridors = min(round(placement.corridor_share * placement.count), len(corridors))
+    taken = farthest_points(position, corridors, on_corridors, [])
     taken = farthest_points(position, np.setdiff1d(calm, taken), placement.count - on_corridors, taken)
     if len(taken) < placement.count:
-        rest = np.setdiff1d(inside, taken)
+        rest = np.setdiff1d(nearby, taken)
         taken = farthest_points(position, rest, placement.count - len(taken), taken)
     return [ids[k] for k in taken]
 
 
-def farthest_points(position: np.ndarray, candidates: np.ndarray, count: int, taken: list[int]) -> list[int]:
-    """Add ``count`` candidates (or all), each as far as can be from those taken; the first one from their middle.
+def farthest_points(
+    position: Float[np.ndarray, "J 2"], candidates: Int[np.ndarray, " C"], count: int, taken: list[int]
+) -> list[int]:
+    """Add candidates one by one, each as far as possible from those taken; the first one from the candidates' mean.
 
     Args:
         position: ``[J, 2]`` m.
-        candidates: indices into it.
-        count: how many to add.
-        taken: indices that are taken already.
+        candidates: indices into ``position``.
+        count: number of candidates to add; all, if there are fewer.
+        taken: indices taken already.
+
+    Returns:
+        ``taken``, followed by the added indices.
     """
     taken = list(taken)
     for _ in range(min(count, len(candidates))):

@@ -1,10 +1,11 @@
-"""What a simulated evacuation leaves: one small file, read without SUMO by training, evaluation and figures."""
+"""The result of a simulated evacuation: one small file, which training, evaluation and figures read without SUMO."""
 
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from uavmec_jax.errors import TrafficError
 from uavmec_jax.files.archives import read_checked, write_checked
@@ -12,15 +13,17 @@ from uavmec_jax.files.validation import suggest
 from uavmec_jax.traffic.place import PLACES, shipped_places
 
 SCHEMA = 1
-"""Version of the file."""
+"""Version of the file format."""
 
 HIGH_TRAFFIC = 0.4
-"""Weight from which a device counts as in high traffic; in the places that ship with the package nobody is near it."""
+"""Weight from which a device counts as being in high traffic. No device of the shipped places has a weight near it."""
 
 
 @dataclass(frozen=True)
 class Evacuation:
-    """A place, its devices, and how dense the traffic near each is.
+    """A place, its devices, and how dense the traffic near each of them is.
+
+    ``n`` devices, ``W`` windows, ``R`` roads with ``P`` corners in total.
 
     Attributes:
         meta: ``place``, ``description``, ``names`` of the devices, ``roads`` by id, ``window_s``, ``mean_s``,
@@ -29,70 +32,70 @@ class Evacuation:
         position: ``[n, 2]`` m in the network.
         density: ``[n]`` vehicles per km and lane near each device, mean over ``mean_s`` of the evacuation and over the seeds.
         density_spread: ``[n]`` standard deviation of the same over the seeds.
-        weight: ``[n]`` in [0, 1], density over that of the busiest device.
-        window_weight: ``[W, n]`` in [0, 1], the same in each window, over the busiest device's busiest window.
-        road_shape: ``[P, 2]`` m, the corners of all roads one after the other.
-        road_corners: ``[R]`` how many corners each road has.
-        road_lanes: ``[R]``.
+        weight: ``[n]`` in [0, 1], density relative to that of the busiest device.
+        window_weight: ``[W, n]`` in [0, 1], density in each window relative to that of the busiest device and window.
+        road_shape: ``[P, 2]`` m, the corners of all roads, one road after the other.
+        road_corners: ``[R]`` number of corners of each road.
+        road_lanes: ``[R]`` number of lanes.
         road_density: ``[W, R]`` vehicles per km and lane, mean over the seeds.
     """
 
     meta: dict[str, Any]
-    position: np.ndarray
-    density: np.ndarray
-    density_spread: np.ndarray
-    weight: np.ndarray
-    window_weight: np.ndarray
-    road_shape: np.ndarray
-    road_corners: np.ndarray
-    road_lanes: np.ndarray
-    road_density: np.ndarray
+    position: Float[np.ndarray, "n 2"]
+    density: Float[np.ndarray, " n"]
+    density_spread: Float[np.ndarray, " n"]
+    weight: Float[np.ndarray, " n"]
+    window_weight: Float[np.ndarray, "W n"]
+    road_shape: Float[np.ndarray, "P 2"]
+    road_corners: Int[np.ndarray, " R"]
+    road_lanes: Int[np.ndarray, " R"]
+    road_density: Float[np.ndarray, "W R"]
 
     @property
     def name(self) -> str:
-        """Of the place."""
+        """Name of the place."""
         return str(self.meta["place"])
 
     @property
     def n_devices(self) -> int:
-        """How many devices there are."""
+        """Number of devices."""
         return len(self.weight)
 
     @property
-    def busy(self) -> np.ndarray:
-        """``[n]`` bool: devices in high traffic, those that see at least :data:`HIGH_TRAFFIC` of the busiest's."""
+    def busy(self) -> Bool[np.ndarray, " n"]:
+        """``[n]`` whether each device is in high traffic: its weight is at least :data:`HIGH_TRAFFIC`."""
         return np.asarray(self.weight >= HIGH_TRAFFIC)
 
     @property
     def roads(self) -> list[np.ndarray]:
-        """The shape of each road, ``[k, 2]`` m."""
+        """Corners of each road, ``[k, 2]`` m."""
         return np.split(self.road_shape, np.cumsum(self.road_corners)[:-1])
 
     @property
-    def mean_road_density(self) -> np.ndarray:
+    def mean_road_density(self) -> Float[np.ndarray, " R"]:
         """``[R]`` vehicles per km and lane, mean over ``mean_s``."""
         first, last = self.meta["mean_windows"]
         return np.asarray(self.road_density[first:last].mean(axis=0))
 
-    def local_position(self, scale_to_m: float | None = None) -> np.ndarray:
-        """``[n, 2]`` m from the south-west corner of what the devices span, where the UAV starts.
+    def local_position(self, scale_to_m: float | None = None) -> Float[np.ndarray, "n 2"]:
+        """Return positions in metres from the south-west corner of the devices' bounding box, where the UAV starts.
 
         Args:
-            scale_to_m: the longer side is scaled to this many metres; by default distances are the real ones.
+            scale_to_m: length to which the box's longer side is scaled; by default distances are the real ones.
         """
         local = self.position - self.position.min(axis=0)
         return local if scale_to_m is None else local * (scale_to_m / local.max())
 
     def region_m(self, scale_to_m: float | None = None) -> tuple[float, float]:
-        """Sides of what the devices span, m, at least 1."""
+        """Return the sides of the devices' bounding box in metres, each at least 1; see :meth:`local_position`."""
         width, height = np.maximum(self.local_position(scale_to_m).max(axis=0), 1.0)
         return float(width), float(height)
 
     def check_hops(self, speed_m_s: float, slot_cap_s: float, scale_to_m: float | None = None) -> None:
-        """Refuse a place where a hop takes longer than a slot may.
+        """Check that no hop between two stops takes longer than a slot may last.
 
         Raises:
-            TrafficError: one line that names the hop.
+            TrafficError: one does; the line names it.
         """
         stops = np.concatenate([np.zeros((1, 2)), self.local_position(scale_to_m)])
         metres = np.linalg.norm(stops[:, None] - stops[None], axis=-1)
@@ -106,17 +109,17 @@ class Evacuation:
             )
 
     def save(self, path: str | Path) -> None:
-        """Write the file, atomic or not at all."""
+        """Write the file atomically."""
         arrays = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "meta"}
         write_checked(Path(path), SCHEMA, {"meta": self.meta}, arrays)
 
 
 def load_evacuation(source: str | Path) -> Evacuation:
-    """The evacuation of a place that ships with the package (``"albany"``, ``"round_lake"``), or of a file.
+    """Load the evacuation of a place that ships with the package (``"albany"``, ``"round_lake"``), or of a file.
 
     Raises:
-        TrafficError: there is none of that name; the file is not there, is damaged, was altered, is something else or of
-            another version; one line.
+        TrafficError: no shipped place has that name; the file does not exist, is damaged, was altered, or is of another kind
+            or version; one line.
     """
     path = Path(source)
     if str(source) in shipped_places():
@@ -124,7 +127,7 @@ def load_evacuation(source: str | Path) -> Evacuation:
     elif not path.exists() and not path.suffix:
         raise TrafficError(f"{source}: neither a file nor a shipped place; {suggest(str(source), shipped_places())}")
     facts, arrays = read_checked(path, SCHEMA, "an evacuation", TrafficError)
-    wanted = {field.name for field in fields(Evacuation)} - {"meta"}
-    if set(arrays) != wanted or "meta" not in facts:
+    expected = {field.name for field in fields(Evacuation)} - {"meta"}
+    if set(arrays) != expected or "meta" not in facts:
         raise TrafficError(f"{path}: is not an evacuation: it holds {', '.join(sorted(arrays))}")
     return Evacuation(meta=facts["meta"], **arrays)

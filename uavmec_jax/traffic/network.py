@@ -1,4 +1,4 @@
-"""Road networks: made by netconvert from checked sources, kept by their hash, and read back as roads and junctions."""
+"""Road networks: built by netconvert from checked sources, cached by their hash, and read as roads and junctions."""
 
 import contextlib
 import hashlib
@@ -12,19 +12,20 @@ from typing import Any
 
 import numpy as np
 import platformdirs
+from jaxtyping import Float, Int
 
 from uavmec_jax.errors import TrafficError
 from uavmec_jax.files.writing import atomic
 from uavmec_jax.traffic import sumo
 from uavmec_jax.traffic.checked_xml import Contents, checked_copy
 from uavmec_jax.traffic.place import NetworkSource
-from uavmec_jax.traffic.workspace import Workshop
+from uavmec_jax.traffic.workspace import Workspace
 
 HIGHWAYS = ("motorway", "motorway_link", "trunk", "trunk_link", "primary")
 """Classes of roads whose ends are exits, unless the user names the exits."""
 
 RESIDENTIAL = ("residential", "living_street", "unclassified")
-"""Classes of roads where people live; the first ones that a network has."""
+"""Classes of roads where people live, in order of preference: the first class that a network has is used."""
 
 _BUILD_LIMIT_S = 900.0
 _PLAIN = ("nodes", "edges", "types")
@@ -38,17 +39,28 @@ _OSM_OPTIONS = (
 
 @dataclass(frozen=True)
 class Road:
-    """One direction of a road between two junctions; ``shape`` is ``[k, 2]`` m, ``name`` may be empty."""
+    """One direction of a road between two junctions.
+
+    Attributes:
+        id: SUMO's id of the edge.
+        name: of the street; may be empty.
+        road_class: OpenStreetMap's class, e.g. ``residential``.
+        lanes: number of lanes.
+        speed_m_s: speed limit.
+        length_m: as SUMO has it.
+        start, end: ids of the junctions.
+        shape: ``[k, 2]`` m, its corners.
+    """
 
     id: str
     name: str
-    kind: str
+    road_class: str
     lanes: int
     speed_m_s: float
     length_m: float
     start: str
     end: str
-    shape: np.ndarray
+    shape: Float[np.ndarray, "k 2"]
 
 
 @dataclass(frozen=True)
@@ -57,145 +69,146 @@ class RoadNetwork:
 
     Attributes:
         roads: by id, in the order of the file.
-        onward: road -> the roads that one can turn into at its end.
+        successors: road -> the roads that one can turn into at its end.
         junctions: id -> ``(x, y)`` m.
         sha256: of the network file without its comments.
-        file: where it is.
+        file: the network file.
     """
 
     roads: dict[str, Road]
-    onward: dict[str, tuple[str, ...]]
+    successors: dict[str, tuple[str, ...]]
     junctions: dict[str, tuple[float, float]]
     sha256: str
     file: Path
 
     @cached_property
-    def backward(self) -> dict[str, list[str]]:
+    def predecessors(self) -> dict[str, list[str]]:
         """Road -> the roads that lead into it."""
-        found: dict[str, list[str]] = {road: [] for road in self.roads}
-        for road, nexts in self.onward.items():
-            for after in nexts:
-                found[after].append(road)
-        return found
+        predecessors: dict[str, list[str]] = {road: [] for road in self.roads}
+        for road, successors in self.successors.items():
+            for successor in successors:
+                predecessors[successor].append(road)
+        return predecessors
 
     @cached_property
     def shapes(self) -> list[np.ndarray]:
-        """The shape of each road, ``[k, 2]`` m."""
+        """Corners of each road, ``[k, 2]`` m."""
         return [road.shape for road in self.roads.values()]
 
     @cached_property
-    def lanes(self) -> np.ndarray:
-        """``[R]`` lanes of each road."""
+    def lanes(self) -> Int[np.ndarray, " R"]:
+        """``[R]`` number of lanes of each road."""
         return np.array([road.lanes for road in self.roads.values()])
 
-    def leading_to(self, road: str) -> set[str]:
-        """The roads from which a car can reach a road, itself among them."""
-        found, frontier = {road}, [road]
+    def roads_reaching(self, road: str) -> set[str]:
+        """Return the roads from which a car can reach a road, including the road itself."""
+        reaching, frontier = {road}, [road]
         while frontier:
-            for before in self.backward[frontier.pop()]:
-                if before not in found:
-                    found.add(before)
-                    frontier.append(before)
-        return found
+            for predecessor in self.predecessors[frontier.pop()]:
+                if predecessor not in reaching:
+                    reaching.add(predecessor)
+                    frontier.append(predecessor)
+        return reaching
 
-    def into(self, junction: str) -> list[Road]:
-        """The roads that end at a junction, the widest first."""
+    def roads_into(self, junction: str) -> list[Road]:
+        """Return the roads that end at a junction, the widest first."""
         return sorted((road for road in self.roads.values() if road.end == junction), key=lambda road: -road.lanes)
 
     def streets_at(self, junction: str) -> list[str]:
-        """Names of the roads that meet at a junction, each once."""
-        named = (road.name for road in self.roads.values() if junction in (road.start, road.end) and road.name)
-        return list(dict.fromkeys(named))
+        """Return the names of the streets that meet at a junction, each once."""
+        names = (road.name for road in self.roads.values() if junction in (road.start, road.end) and road.name)
+        return list(dict.fromkeys(names))
 
-    def is_end(self, road: Road) -> bool:
-        """Whether nothing but the way back goes on from a road."""
-        return all(self.roads[after].end == road.start for after in self.onward[road.id])
+    def is_sink(self, road: Road) -> bool:
+        """Return whether a road ends without a way on, other than its own opposite direction."""
+        return all(self.roads[successor].end == road.start for successor in self.successors[road.id])
 
-    def is_beginning(self, road: Road) -> bool:
-        """Whether nothing but its own opposite leads into a road."""
-        return all(self.roads[before].start == road.end for before in self.backward[road.id])
+    def is_source(self, road: Road) -> bool:
+        """Return whether no road leads into a road, other than its own opposite direction."""
+        return all(self.roads[predecessor].start == road.end for predecessor in self.predecessors[road.id])
 
-    def of_kind(self, kinds: Iterable[str]) -> list[Road]:
-        """Roads of some classes."""
-        wanted = set(kinds)
-        return [road for road in self.roads.values() if road.kind in wanted]
+    def of_class(self, road_classes: Iterable[str]) -> list[Road]:
+        """Return the roads of some classes."""
+        wanted = set(road_classes)
+        return [road for road in self.roads.values() if road.road_class in wanted]
 
 
-def build_network(source: NetworkSource, folder: Path, workshop: Workshop) -> RoadNetwork:
-    """The network of a place, checked, built if this machine has not built it before.
+def build_network(source: NetworkSource, folder: Path, workspace: Workspace) -> RoadNetwork:
+    """Check the sources of a network and build it, unless this machine has it in its cache.
 
     Args:
-        source: where it comes from.
-        folder: that relative paths start from.
-        workshop: where it is worked on.
+        source: the files of the network.
+        folder: relative paths start from here.
+        workspace: where it is built.
 
     Raises:
         TrafficError: a file is not usable, SUMO is missing or fails, or there are no roads or junctions.
     """
-    target = workshop.folder / "network.net.xml"
+    target = workspace.folder / "network.net.xml"
     if source.net is not None:
         checked_copy(folder / source.net, target, "net")
         return read_network(target, str(source.net))
-    name, options = _prepare(source, folder, workshop)
+    name, options = _copy_sources(source, folder, workspace)
     command: list[str | Path] = [sumo.program("netconvert"), *options, "--output-file", target]
-    kept = _kept(options, workshop)
-    if kept.is_file():
-        shutil.copyfile(kept, target)
+    cached = _cache_path(options, workspace)
+    if cached.is_file():
+        shutil.copyfile(cached, target)
     else:
         try:
-            workshop.run("netconvert", command, limit_s=_BUILD_LIMIT_S, env=sumo.environment())
+            workspace.run("netconvert", command, limit_s=_BUILD_LIMIT_S, env=sumo.environment())
         except TrafficError as error:
             raise TrafficError(f"{name}: {error}") from None
-        _keep(target, kept)
+        _store_in_cache(target, cached)
     return read_network(target, name)
 
 
-def _prepare(source: NetworkSource, folder: Path, workshop: Workshop) -> tuple[str, list[str]]:
-    """Check the sources into the workshop; their name for messages and netconvert's options."""
+def _copy_sources(source: NetworkSource, folder: Path, workspace: Workspace) -> tuple[str, list[str]]:
+    """Copy the checked sources into the workspace; return their name for messages, and netconvert's options."""
     if source.osm is not None:
         path = folder / source.osm
-        found = checked_copy(path, workshop.folder / "map.osm.xml", "osm")
+        contents = checked_copy(path, workspace.folder / "map.osm.xml", "osm")
         options = ["--osm-files", "map.osm.xml", *_OSM_OPTIONS]
-        if not found.counts["way"]:
-            raise TrafficError(f"{path}: holds no roads and no junctions ({found.counts['node']} nodes, 0 ways)")
+        if not contents.counts["way"]:
+            raise TrafficError(f"{path}: holds no roads and no junctions ({contents.counts['node']} nodes, 0 ways)")
         if source.bbox is not None:
-            _check_box(path, source.bbox, found)
+            _check_box(path, source.bbox, contents)
             options += ["--keep-edges.in-geo-boundary", ",".join(map(str, source.bbox))]
         return str(path), options
     options = list(_PLAIN_OPTIONS)
     for kind in _PLAIN:
-        checked_copy(folder / str(getattr(source, kind)), workshop.folder / f"plain.{kind}.xml", kind)
+        checked_copy(folder / str(getattr(source, kind)), workspace.folder / f"plain.{kind}.xml", kind)
         options += [f"--{kind[:-1]}-files", f"plain.{kind}.xml"]
     return str(folder / str(source.edges)), options
 
 
-def _check_box(path: Path, bbox: tuple[float, float, float, float], found: Contents) -> None:
-    if not found.overlaps(bbox):
+def _check_box(path: Path, bbox: tuple[float, float, float, float], contents: Contents) -> None:
+    if not contents.overlaps(bbox):
+        extent = f"{contents.west:.4f},{contents.south:.4f},{contents.east:.4f},{contents.north:.4f}"
         raise TrafficError(
             f"{path}: the bounding box {','.join(f'{side:g}' for side in bbox)} lies outside the extract, which spans "
-            f"{found.west:.4f},{found.south:.4f},{found.east:.4f},{found.north:.4f} (west,south,east,north)"
+            f"{extent} (west,south,east,north)"
         )
 
 
-def _kept(options: list[str], workshop: Workshop) -> Path:
-    """Where a network with this source, these options and this version of SUMO is kept."""
+def _cache_path(options: list[str], workspace: Workspace) -> Path:
+    """Return where a network with these sources, these options and this version of SUMO is cached."""
     digest = hashlib.sha256("\n".join([sumo.version(), *options]).encode())
     for option in options:
         if option.endswith(".xml"):
-            digest.update((workshop.folder / option).read_bytes())
+            digest.update((workspace.folder / option).read_bytes())
     return Path(platformdirs.user_cache_dir("uavmec-jax")) / "networks" / f"{digest.hexdigest()}.net.xml"
 
 
-def _keep(built: Path, kept: Path) -> None:
-    """Keep a network for the next time; where that cannot be, there is no next time."""
+def _store_in_cache(network: Path, cached: Path) -> None:
+    """Copy a network into the cache; do nothing where the cache cannot be written."""
     with contextlib.suppress(OSError):
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        with atomic(kept) as partial:
-            shutil.copyfile(built, partial)
+        cached.parent.mkdir(parents=True, exist_ok=True)
+        with atomic(cached) as partial:
+            shutil.copyfile(network, partial)
 
 
 def read_network(file: Path, name: str) -> RoadNetwork:
-    """Roads and junctions of a checked network file; ``name`` stands for it in messages.
+    """Read the roads and junctions of a checked network file; ``name`` stands for it in messages.
 
     Raises:
         TrafficError: SUMO is missing, or there are no roads or junctions.
@@ -204,8 +217,8 @@ def read_network(file: Path, name: str) -> RoadNetwork:
         net = sumo.read_network(file)
     except TrafficError as error:
         raise TrafficError(f"{name}: {error}") from None
-    roads = {edge.getID(): _road(edge) for edge in net.getEdges() if edge.allows("passenger")}
-    onward = {
+    roads = {edge.getID(): _make_road(edge) for edge in net.getEdges() if edge.allows("passenger")}
+    successors = {
         edge.getID(): tuple(after.getID() for after in edge.getOutgoing() if after.getID() in roads)
         for edge in net.getEdges()
         if edge.getID() in roads
@@ -214,19 +227,19 @@ def read_network(file: Path, name: str) -> RoadNetwork:
     junctions = {node.getID(): node.getCoord()[:2] for node in net.getNodes() if node.getID() in used}
     if not roads or len(junctions) < 2:
         raise TrafficError(f"{name}: has no junctions with roads for cars between them")
-    return RoadNetwork(roads, onward, junctions, _digest(file), file)
+    return RoadNetwork(roads, successors, junctions, _digest(file), file)
 
 
 def _digest(file: Path) -> str:
-    """SHA-256 of a network without its comments: netconvert writes the date of the day into one."""
+    """Return the SHA-256 of a network without its comments, one of which holds the date on which it was built."""
     return hashlib.sha256(re.sub(rb"<!--.*?-->", b"", file.read_bytes(), flags=re.DOTALL)).hexdigest()
 
 
-def _road(edge: Any) -> Road:
+def _make_road(edge: Any) -> Road:
     return Road(
         id=edge.getID(),
         name=edge.getName() or "",
-        kind=(edge.getType() or "").split("|")[0].rpartition(".")[2],
+        road_class=(edge.getType() or "").split("|")[0].rpartition(".")[2],
         lanes=edge.getLaneNumber(),
         speed_m_s=edge.getSpeed(),
         length_m=edge.getLength(),

@@ -1,4 +1,4 @@
-"""Places: where the road network comes from, who drives, where the devices are. Read from TOML, every number checked."""
+"""Places: a road network, its travel demand and its devices, read from TOML; every value is checked."""
 
 from importlib import resources
 from pathlib import Path
@@ -19,15 +19,15 @@ PLACES = resources.files("uavmec_jax.traffic") / "places"
 
 
 def shipped_places() -> tuple[str, ...]:
-    """Names of the places that ship with the package."""
+    """Return the names of the places that ship with the package."""
     return tuple(sorted(folder.name for folder in PLACES.iterdir() if folder.is_dir()))
 
 
 class NetworkSource(StrictModel):
-    """Where the roads come from: one of the three kinds. Paths are relative to the file of the place."""
+    """The files that the roads come from, of one of three kinds. Paths are relative to the file of the place."""
 
     nodes: str | None = None
-    """SUMO's plain XML: nodes, edges and types."""
+    """SUMO's plain XML, together with ``edges`` and ``types``."""
     edges: str | None = None
     types: str | None = None
     osm: str | None = None
@@ -35,7 +35,7 @@ class NetworkSource(StrictModel):
     bbox: Annotated[tuple[float, float, float, float] | None, from_array] = None
     """Part of the extract: west, south, east, north, in degrees."""
     net: str | None = None
-    """A network that SUMO's netconvert has made."""
+    """A network built by SUMO's netconvert."""
 
     @pydantic.model_validator(mode="after")
     def _check(self) -> "NetworkSource":
@@ -52,34 +52,34 @@ class NetworkSource(StrictModel):
 
 
 class Demand(StrictModel):
-    """AgentIds drives, and when."""
+    """Travel demand: which vehicles drive, and when."""
 
     vehicles: Annotated[int, Field(ge=1, le=1_000_000)] = 4000
     """Vehicles that are evacuated."""
     loading_sigma_s: _Positive = 1200.0
-    """Rayleigh loading: by ``t`` seconds after the order, ``1 - exp(-t^2 / (2 sigma^2))`` of them have left."""
+    """Rayleigh loading: a share ``1 - exp(-t^2 / (2 sigma^2))`` of them has left ``t`` seconds after the order to leave."""
     through_per_hour: _NotNegative = 600.0
-    """Vehicles that pass through, from one highway end to another."""
+    """Vehicles per hour that pass through, from one highway end to another."""
     warm_up_s: _NotNegative = 600.0
-    """Seconds of through traffic alone before the order to leave."""
+    """Seconds of through traffic before the order to leave."""
     origins: Annotated[tuple[str, ...], from_array] = ()
-    """Edges where people live; by default the residential roads. Each is weighted by its length."""
+    """Roads where people live, weighted by their lengths; by default the residential roads."""
     exits: dict[str, _Positive] = Field(default_factory=dict)
-    """Junctions or edges where they leave -> weight; by default the highway ends, weighted by their lanes."""
+    """Junctions or roads where vehicles leave -> weight; by default the highway ends, weighted by lanes times speed."""
     rerouting: Annotated[float, Field(ge=0, le=1)] = 1.0
-    """Share of the drivers who look for a faster way while they drive."""
+    """Share of the drivers who look for a faster route on the way."""
 
 
 class Simulation(StrictModel):
-    """How the evacuation is simulated and averaged."""
+    """Settings of the simulations and of the averages over them."""
 
     seeds: Annotated[int, Field(ge=1, le=1000)] = 5
     duration_s: _Positive = 7200.0
-    """Seconds after the order to leave."""
+    """Seconds simulated after the order to leave."""
     window_s: _Positive = 600.0
-    """Densities are averaged over windows of this length."""
+    """Length of the windows over which densities are averaged."""
     mean_s: Annotated[tuple[_NotNegative, _Positive], from_array] = (0.0, 3600.0)
-    """Devices' weights are means over this part of the evacuation."""
+    """Part of the evacuation over which the devices' weights are averaged."""
     time_limit_s: _Positive = 900.0
     """Wall-clock seconds after which one simulation is stopped."""
 
@@ -96,23 +96,23 @@ class Simulation(StrictModel):
         first, last = self.windows
         if not 0 <= first < last:
             raise ValueError(
-                f"simulation.mean_s is {list(self.mean_s)}; give [from, to] with atomic windows within the evacuation"
+                f"simulation.mean_s is {list(self.mean_s)}; give [from, to] with whole windows within the evacuation"
             )
         return self
 
     @property
     def n_windows(self) -> int:
-        """Windows of the evacuation."""
+        """Number of windows in the evacuation."""
         return int(self.duration_s // self.window_s)
 
     @property
     def windows(self) -> tuple[int, int]:
-        """First and one past the last window of the mean."""
+        """First window of the mean, and one past the last."""
         return round(self.mean_s[0] / self.window_s), min(round(self.mean_s[1] / self.window_s), self.n_windows)
 
 
 class Site(StrictModel):
-    """One device of a file: at a junction, or at a point of the network in metres."""
+    """A device of the file: at a junction, or at a point of the network in metres."""
 
     name: Annotated[str, Field(min_length=1, max_length=80)]
     junction: str | None = None
@@ -127,15 +127,15 @@ class Site(StrictModel):
 
 
 class Placement(StrictModel):
-    """Where devices go that no file places: junctions far from each other, some of them on the corridors."""
+    """How to place devices that the file does not list: at junctions far apart, a share of them on busy corridors."""
 
     count: Annotated[int, Field(ge=2, le=MAX_DEVICES)] = 12
     corridor_share: Annotated[float, Field(ge=0, le=1)] = 0.5
-    """Share of the devices among the fifth of the junctions with the densest traffic; the others are off them."""
+    """Share of the devices that stand at the fifth of the junctions with the densest traffic."""
     span_m: _Positive = 1500.0
-    """Side of the square around the middle of the origins that they are placed in."""
+    """Side of the square, around the centre of the origins, in which they are placed."""
     radius_m: _Positive = 100.0
-    """Roads within this distance of a device count for its weight."""
+    """Distance from a device within which roads count towards its weight."""
 
 
 class Place(StrictModel):
@@ -161,14 +161,18 @@ class Place(StrictModel):
 
 
 def load_place(source: str | Path, overrides: dict[str, Any] | None = None) -> tuple[Place, Path]:
-    """Read a place that ships with the package, or a file; and the folder that its paths are relative to.
+    """Load a place that ships with the package, or a file.
 
     Args:
         source: ``"albany"``, or the path of a ``.toml`` file.
-        overrides: tables of settings that go before those of the file, and a list of devices that replaces its own.
+        overrides: tables of settings, which take precedence over those of the file, and a list of devices, which replaces
+            the file's.
+
+    Returns:
+        The place, and the folder that its paths are relative to.
 
     Raises:
-        TrafficError: the file is not there, is not TOML, or holds something that does not fit; one line.
+        TrafficError: the file does not exist, is not TOML, or holds an invalid value; one line.
     """
     if str(source) in shipped_places():
         path = Path(str(PLACES / str(source) / "place.toml"))
@@ -186,10 +190,10 @@ def load_place(source: str | Path, overrides: dict[str, Any] | None = None) -> t
 
 
 def make_place(data: dict[str, Any], source: str) -> Place:
-    """A checked place from plain data as a file holds it; ``source`` names it in messages.
+    """Make a place from plain data, as a file holds it, and check it; ``source`` names it in messages.
 
     Raises:
-        TrafficError: something does not fit; one line.
+        TrafficError: a value is invalid; one line.
     """
     try:
         return Place.model_validate(data)

@@ -1,4 +1,4 @@
-"""Where SUMO is; it is an extra of the package, and nothing but `uavmec traffic build` needs it."""
+"""Locate and load SUMO, an optional extra of the package that only `uavmec traffic build` needs."""
 
 import importlib
 import os
@@ -8,7 +8,7 @@ from typing import Any
 from uavmec_jax.errors import TrafficError
 
 
-def _package(name: str) -> Any:
+def _import_module(name: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -18,30 +18,30 @@ def _package(name: str) -> Any:
 
 
 def home() -> Path:
-    """The folder of SUMO's programs and data.
+    """Return the folder of SUMO's programs and data.
 
     Raises:
         TrafficError: SUMO is not installed.
     """
-    return Path(_package("sumo").SUMO_HOME)
+    return Path(_import_module("sumo").SUMO_HOME)
 
 
 def version() -> str:
-    """SUMO's version, e.g. ``1.28.0``.
+    """Return SUMO's version, e.g. ``1.28.0``.
 
     Raises:
         TrafficError: SUMO is not installed.
     """
-    return str(_package("libsumo").getVersion()[1]).removeprefix("SUMO ")
+    return str(_import_module("libsumo").getVersion()[1]).removeprefix("SUMO ")
 
 
 def environment() -> dict[str, str]:
-    """What SUMO's programs look for in the environment."""
+    """Return the environment variables that SUMO's programs need."""
     return {"SUMO_HOME": str(home())}
 
 
 def program(name: str) -> Path:
-    """The path of one of SUMO's programs.
+    """Return the path of one of SUMO's programs.
 
     Raises:
         TrafficError: SUMO is not installed, or has no such program.
@@ -53,14 +53,14 @@ def program(name: str) -> Path:
 
 
 def read_network(path: Path) -> Any:
-    """A checked network file as sumolib's ``Net``, without internal edges.
+    """Read a checked network file into sumolib's ``Net``, without internal edges.
 
     Raises:
-        TrafficError: SUMO is not installed, or the network does not make sense.
+        TrafficError: SUMO is not installed, or cannot read the network.
     """
     try:
-        return _package("sumolib.net").readNet(str(path), withInternal=False)
+        return _import_module("sumolib.net").readNet(str(path), withInternal=False)
     except TrafficError:
         raise
-    except Exception as error:  # sumolib trusts its input and raises whatever it stumbles over
+    except Exception as error:  # sumolib trusts its input; bad input raises exceptions of all kinds
         raise TrafficError(f"{path.name}: is not a network that SUMO can read: {error!r}") from None

@@ -1,7 +1,8 @@
-"""One simulation in a process of its own: ``python -m uavmec_jax.traffic.worker JOB.json``.
+"""One simulation in its own process: ``python -m uavmec_jax.traffic.worker JOB.json``.
 
-SUMO's library holds one simulation a process, and a crash of it must not be ours. Imports neither JAX nor the package's
-other rooms; :mod:`uavmec_jax.traffic.simulation` starts it and reads what it leaves.
+SUMO's library holds one simulation per process, and a crash in it must not take the caller down.
+:mod:`uavmec_jax.traffic.simulation` starts this process and reads its result. Neither JAX nor the other subpackages are
+imported here, so that it starts quickly.
 """
 
 import json
@@ -26,31 +27,32 @@ def simulate(job: dict[str, Any]) -> None:
     Path(f"{name}.add.xml").write_text(
         _ADDITIONAL.format(name=name, begin=job["begin"], end=end, window_s=job["window_s"])
     )
-    libsumo.start(
-        [
-            "sumo",
-            *("--net-file", job["network"], "--route-files", job["trips"], "--additional-files", f"{name}.add.xml"),
-            *("--statistic-output", f"{name}.statistics.xml", "--seed", str(job["seed"]), "--end", str(end)),
-            *(
-                "--device.rerouting.probability",
-                str(job["rerouting"]),
-                "--no-step-log",
-                "true",
-                "--no-warnings",
-                "true",
-            ),
-            *("--xml-validation", "never", "--duration-log.disable", "true", "--ignore-route-errors", "true"),
-        ]
-    )
+    options = {
+        "--net-file": job["network"],
+        "--route-files": job["trips"],
+        "--additional-files": f"{name}.add.xml",
+        "--statistic-output": f"{name}.statistics.xml",
+        "--seed": str(job["seed"]),
+        "--end": str(end),
+        "--device.rerouting.probability": str(job["rerouting"]),
+        "--no-step-log": "true",
+        "--no-warnings": "true",
+        "--xml-validation": "never",
+        "--duration-log.disable": "true",
+        "--ignore-route-errors": "true",
+    }
+    libsumo.start(["sumo", *(part for option in options.items() for part in option)])
     libsumo.simulationStep(end)
     libsumo.close()
-    density = _densities(Path(f"{name}.density.xml"), job["roads"], job["windows"])
-    found: dict[str, Any] = {"density": density, **_counts(Path(f"{name}.statistics.xml"), job["drivers"])}
-    np.savez(f"{name}.npz", **found)
+    results: dict[str, Any] = {
+        "density": _read_densities(Path(f"{name}.density.xml"), job["roads"], job["windows"]),
+        **_read_counts(Path(f"{name}.statistics.xml"), job["vehicles"]),
+    }
+    np.savez(f"{name}.npz", **results)
 
 
-def _densities(path: Path, roads: list[str], windows: int) -> np.ndarray:
-    """Empty roads have no entry, or a blank one: 0."""
+def _read_densities(path: Path, roads: list[str], windows: int) -> np.ndarray:
+    """Read the density ``[W, R]`` of every road in every window; a road without traffic has no entry, or a blank one."""
     column = {road: k for k, road in enumerate(roads)}
     density = np.zeros((windows, len(roads)), np.float32)
     window = -1
@@ -64,22 +66,32 @@ def _densities(path: Path, roads: list[str], windows: int) -> np.ndarray:
     return density
 
 
-def _counts(path: Path, drivers: int) -> dict[str, int]:
-    """Drivers, those who had not arrived by the end (or found no way), and those whom SUMO moved because they were stuck."""
+def _read_counts(path: Path, trips: int) -> dict[str, int]:
+    """Count the vehicles.
+
+    Args:
+        path: SUMO's statistics.
+        trips: number of trips that SUMO was given.
+
+    Returns:
+        ``loaded``, all trips; ``unfinished``, those that had not arrived by the end or found no way; ``teleports``, vehicles
+        that SUMO moved because they were stuck.
+    """
     root = ElementTree.parse(path).getroot()
-    found = {tag: root.find(tag) for tag in ("vehicles", "teleports")}
-    read = {tag: dict(element.attrib) if element is not None else {} for tag, element in found.items()}
-    vehicles = {key: int(value) for key, value in read["vehicles"].items()}
+    elements = {tag: root.find(tag) for tag in ("vehicles", "teleports")}
+    statistics = {tag: dict(element.attrib) if element is not None else {} for tag, element in elements.items()}
+    vehicles = {key: int(value) for key, value in statistics["vehicles"].items()}
     return {
-        "loaded": drivers,
-        "unfinished": drivers - vehicles.get("inserted", 0) + vehicles.get("running", 0),
-        "teleports": int(read["teleports"].get("total", 0)),
+        "loaded": trips,
+        "unfinished": trips - vehicles.get("inserted", 0) + vehicles.get("running", 0),
+        "teleports": int(statistics["teleports"].get("total", 0)),
     }
 
 
 if __name__ == "__main__":
     try:
         simulate(json.loads(Path(sys.argv[1]).read_text(encoding="utf-8")))
-    except Exception as error:  # SUMO's own, over several lines; it has already said what it has no words for here
-        words = " ".join(str(error).split())
-        sys.exit(f"Error: {words}" if words and "proxy of" not in words else 1)
+    except Exception as error:
+        message = " ".join(str(error).split())  # SUMO's messages span several lines
+        # libsumo's "proxy of" messages are empty wrappers: SUMO has already printed the error itself.
+        sys.exit(f"Error: {message}" if message and "proxy of" not in message else 1)

@@ -1,4 +1,4 @@
-"""A temporary folder and the processes that work in it; none of them outlives us, however we end."""
+"""A temporary folder and the processes that run in it; neither outlives this process, however it ends."""
 
 import contextlib
 import os
@@ -13,7 +13,7 @@ from types import TracebackType
 
 from uavmec_jax.errors import TrafficError
 
-_GUARDIAN = """
+_WATCHDOG = """
 import os, shutil, signal, sys, time
 running = set()
 for line in sys.stdin:
@@ -30,24 +30,25 @@ for _ in range(50):
         break
     time.sleep(0.1)
 """
-"""Reads which processes work; when we end, even by SIGKILL, its input ends, and it kills them and removes the folder."""
+"""A script that reads from its standard input which processes are running. When this process ends, even by SIGKILL, that
+input ends too; the script then kills the processes and removes the folder."""
 
 
-class Workshop:
-    """A context manager: a temporary folder, and programs run in it with a time limit."""
+class Workspace:
+    """A temporary folder, and programs that run in it with a time limit; a context manager."""
 
-    def __enter__(self) -> "Workshop":
+    def __enter__(self) -> "Workspace":
         self.folder = Path(tempfile.mkdtemp(prefix="uavmec-traffic-"))
         self._lock = threading.Lock()
         self._running: set[subprocess.Popen] = set()
-        self._closed = False
-        self._guardian = subprocess.Popen(
-            [sys.executable, "-S", "-E", "-c", _GUARDIAN, str(self.folder)],
+        self._stopped = False
+        self._watchdog = subprocess.Popen(
+            [sys.executable, "-S", "-E", "-c", _WATCHDOG, str(self.folder)],
             stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,  # who reads what we print does not wait for it
+            stdout=subprocess.DEVNULL,  # a reader of our output must not wait for the watchdog to end
             stderr=subprocess.DEVNULL,
             text=True,
-            start_new_session=True,  # Ctrl-C ends the commands of the terminal, not this one
+            start_new_session=True,  # Ctrl-C reaches the processes of the terminal's session, and must not reach this one
         )
         return self
 
@@ -55,16 +56,16 @@ class Workshop:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.stop()
-        assert self._guardian.stdin is not None
+        assert self._watchdog.stdin is not None
         with contextlib.suppress(OSError):
-            self._guardian.stdin.close()
-        self._guardian.wait()
+            self._watchdog.stdin.close()
+        self._watchdog.wait()
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def stop(self) -> None:
-        """End every program at once; none is started any more."""
+        """Kill all running programs and refuse to start new ones."""
         with self._lock:
-            self._closed = True
+            self._stopped = True
             running = list(self._running)
         for process in running:
             process.kill()
@@ -72,32 +73,32 @@ class Workshop:
     def run(
         self, name: str, command: Sequence[str | Path], *, limit_s: float, env: Mapping[str, str] | None = None
     ) -> str:
-        """Run a program in the folder and return what it printed.
+        """Run a program in the folder and return what it prints.
 
         Args:
-            name: of the program, for messages.
+            name: of the program, for error messages.
             command: the program and its arguments.
             limit_s: seconds after which it is killed.
-            env: added to the environment.
+            env: environment variables, added to those of this process.
 
         Raises:
-            TrafficError: it failed (its last line of error), or took too long.
+            TrafficError: the program failed (the message is its last error) or took too long.
         """
         with self._start(command, env) as process:
             try:
-                out, said = process.communicate(timeout=limit_s)
+                stdout, stderr = process.communicate(timeout=limit_s)
             except subprocess.TimeoutExpired:
                 raise TrafficError(f"{name}: did not end within its limit of {limit_s:g} s and was stopped") from None
             finally:
                 process.kill()
-                self._tell("-", process)
+                self._notify_watchdog("-", process)
         if process.returncode != 0:
-            raise TrafficError(f"{name}: {last_error(said + out) or f'ended with exit code {process.returncode}'}")
-        return out
+            raise TrafficError(f"{name}: {last_error(stderr + stdout) or f'ended with exit code {process.returncode}'}")
+        return stdout
 
     def _start(self, command: Sequence[str | Path], env: Mapping[str, str] | None) -> subprocess.Popen:
         with self._lock:
-            if self._closed:
+            if self._stopped:
                 raise TrafficError("stopped before it was started")
             process = subprocess.Popen(
                 [str(part) for part in command],
@@ -110,21 +111,21 @@ class Workshop:
                 errors="replace",
             )
             self._running.add(process)
-        self._tell("+", process)
+        self._notify_watchdog("+", process)
         return process
 
-    def _tell(self, sign: str, process: subprocess.Popen) -> None:
+    def _notify_watchdog(self, sign: str, process: subprocess.Popen) -> None:
         with self._lock:
             if sign == "-":
                 self._running.discard(process)
-            assert self._guardian.stdin is not None
-            with contextlib.suppress(OSError):  # somebody has killed it: then only we clean up
-                self._guardian.stdin.write(f"{sign}{process.pid}\n")
-                self._guardian.stdin.flush()
+            assert self._watchdog.stdin is not None
+            with contextlib.suppress(OSError):  # the watchdog was killed: then only `__exit__` cleans up
+                self._watchdog.stdin.write(f"{sign}{process.pid}\n")
+                self._watchdog.stdin.flush()
 
 
-def last_error(said: str) -> str:
-    """The last line that reports an error, without the word, or the last line of all."""
-    lines = [line.strip() for line in said.splitlines() if line.strip() and not line.startswith("Quitting")]
+def last_error(output: str) -> str:
+    """Return the last line that reports an error, without the word ``Error``; the last line if none does."""
+    lines = [line.strip() for line in output.splitlines() if line.strip() and not line.startswith("Quitting")]
     errors = [line for line in lines if line.startswith("Error")]
     return (errors or lines or [""])[-1].removeprefix("Error:").strip()
