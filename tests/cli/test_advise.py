@@ -1,6 +1,7 @@
-"""`uavmec advise` and the policy that ships with the package, as a user meets them."""
+"""`uavmec advise`, and the policy that ships with the package."""
 
 import json
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from tests.scenarios.test_scenario_files import EXAMPLES
 from uavmec_jax.cli import main
 from uavmec_jax.env.rollout import rollout_from
 from uavmec_jax.scenarios.policies import load_policy
+from uavmec_jax.scenarios.state_files import state_data
 
 HARBOUR = EXAMPLES / "harbour.toml"
 
@@ -28,39 +30,35 @@ def generalist():
 
 
 @pytest.fixture(scope="module")
-def told():
+def advice():
     done = advise(HARBOUR, "--samples", 32, "--json")
     assert done.exit_code == 0, done.output
     return json.loads(done.stdout)
 
 
-def test_json_says_what_was_asked(told):
-    names = um.scenarios.load_scenario_file(HARBOUR).names
-    assert told["next"]["name"] in names
-    assert told["ranking"][0]["name"] == told["next"]["name"]
-    assert sorted(one["name"] for one in told["ranking"]) == sorted(names)
-    assert set(told["first_failure"]) == set(names)
-    assert abs(sum(told["first_failure"].values()) + told["no_device_fails"] - 1) < 1e-3
-    low, high = told["lifetime"]["interval"]
-    assert low <= told["lifetime"]["mean"] <= high
-    assert told["lifetime"]["futures"] == 32
-    assert told["what_if"][0]["gain"] >= told["what_if"][-1]["gain"]
-    assert told["warnings"] == []
+def test_json_has_the_advice(advice):
+    names = um.scenarios.load_scenario_file(HARBOUR).device_names
+    assert advice["next"]["name"] in names
+    assert advice["ranking"][0]["name"] == advice["next"]["name"]
+    assert sorted(candidate["name"] for candidate in advice["ranking"]) == sorted(names)
+    assert set(advice["first_failure"]) == set(names)
+    assert abs(sum(advice["first_failure"].values()) + advice["no_device_fails"] - 1) < 1e-3
+    low, high = advice["lifetime"]["interval"]
+    assert low <= advice["lifetime"]["mean"] <= high
+    assert advice["lifetime"]["futures"] == 32
+    assert advice["what_if"][0]["gain"] >= advice["what_if"][-1]["gain"]
+    assert advice["warnings"] == []
 
 
 @pytest.mark.slow
-def test_one_visit_after_the_other(tmp_path, told):
-    """The state that it prints can be given back; the next one is advised on likewise."""
-    named_scenario = um.scenarios.load_scenario_file(HARBOUR)
-    state = um.initial_state(named_scenario.params, named_scenario.layout)
+def test_one_visit_after_the_other(tmp_path, advice):
+    """The state after a visit is read back and advised on."""
+    scenario = um.scenarios.load_scenario_file(HARBOUR)
+    state = um.initial_state(scenario.params, scenario.layout)
     volumes = jnp.full(6, 3e6)
-    after, outcome = um.transition(
-        named_scenario.params, named_scenario.layout, state, told["next"]["device"] - 1, volumes
-    )
+    after, outcome = um.transition(scenario.params, scenario.layout, state, advice["next"]["device"] - 1, volumes)
     assert int(outcome.cause) == um.Cause.NONE
-    from uavmec_jax.scenarios.state_files import state_data
-
-    (tmp_path / "now.json").write_text(json.dumps(state_data(after, named_scenario)))
+    (tmp_path / "now.json").write_text(json.dumps(state_data(replace(scenario, state=after))))
     done = advise(HARBOUR, "--state", tmp_path / "now.json", "--samples", 32, "--json", "--no-what-if")
     again = json.loads(done.stdout)
     assert again["state"]["slot"] == 1
@@ -77,7 +75,7 @@ def test_tables(generalist):
 
 
 @pytest.mark.slow
-def test_a_layout_unlike_the_training_is_warned_of_and_advised_on(tmp_path):
+def test_a_scenario_out_of_distribution_is_advised_on_with_a_warning(tmp_path):
     text = HARBOUR.read_text().replace("capacity_j = 7", "capacity_j = 97", 1)
     (tmp_path / "big.toml").write_text(text)
     done = advise(tmp_path / "big.toml", "--samples", 8, "--no-what-if", "--json")
@@ -94,12 +92,12 @@ def test_a_layout_unlike_the_training_is_warned_of_and_advised_on(tmp_path):
     [
         (("--samples", 1), "--samples is 1; give 2 to 100000 futures"),
         (("--policy", "generalst"), "did you mean 'generalist'?"),
-        (("--price", 3), "--price is given, but nobody knows the traffic"),
+        (("--price", 3), "price is given, but the traffic of these devices is unknown"),
         (("--powered", 3), "leave out --powered"),
         (("--state", "nowhere.json"), "nowhere.json"),
     ],
 )
-def test_mistakes_are_one_line(arguments, words):
+def test_bad_input_is_one_line(arguments, words):
     done = advise(HARBOUR, *arguments)
     assert done.exit_code == 2
     assert words in done.stderr
@@ -115,61 +113,60 @@ def test_traffic_has_a_price():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("n", [2, 12, 30])
-def test_the_shipped_policy_is_a_policy_like_any_other(generalist, n):
+def test_the_shipped_policy_takes_any_number_of_devices(generalist, n):
     params = um.Params(n_devices=n)
     layout = um.sample_layout(jax.random.key(n), params, n // 2, n // 2)
     state = um.initial_state(params, layout)
-    alone = generalist(params, layout, state)
-    assert alone.shape == ()
-    assert 0 <= int(alone) < n
-    assert int(jax.jit(generalist)(params, layout, state)) == int(alone)
+    action = generalist(params, layout, state)
+    assert action.shape == ()
+    assert 0 <= int(action) < n
+    assert int(jax.jit(generalist)(params, layout, state)) == int(action)
     states = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), state)
-    assert_array_equal(generalist(params, layout, states), [alone, alone])
+    assert_array_equal(generalist(params, layout, states), [action, action])
     assert generalist.value_fn(params, layout, states).shape == (2,)
 
 
 @pytest.mark.slow
-def test_it_decides_from_raw_observations(generalist):
+def test_the_shipped_policy_acts_on_raw_observations(generalist):
     params, layout = um.Params(), um.sample_layout(jax.random.key(1), um.Params(), 8, 8)
     state = um.initial_state(params, layout)
-    seen = um.planning.observe_devices(params, layout, state)
-    row = np.concatenate([seen.features, np.ones((12, 1), np.float32)], axis=1).reshape(-1)
-    assert generalist.act(row) == int(generalist(params, layout, state))
+    features = um.planning.observe_devices(params, layout, state).features
+    observation = np.concatenate([features, np.ones((12, 1), np.float32)], axis=1).reshape(-1)
+    assert generalist.act(observation) == int(generalist(params, layout, state))
     with pytest.raises(um.UserError, match="it should be"):
-        generalist.act(row[:-1])
+        generalist.act(observation[:-1])
 
 
 @pytest.mark.slow
-def test_it_is_far_above_oldest_first(generalist):
-    """Eight towns of the middle of the grid: 15 % is two thirds of what `results/generalist` has there."""
+def test_the_shipped_policy_outlives_oldest_first(generalist):
+    """Check 24 scenarios of the middle of the grid; `results/generalist` has the gain on all of it."""
     params = um.Params()
 
     @jax.jit
-    def lives(key):
+    def lifetimes(key):
         layout = um.sample_layout(key, params, 8, 8)
         keys = jax.random.split(key, 4)
         return [
-            um.rollouts(one, params, layout, keys).length
-            for one in (generalist, um.planning.HEURISTICS["oldest-first"])
+            um.rollouts(policy, params, layout, keys).length
+            for policy in (generalist, um.planning.HEURISTICS["oldest-first"])
         ]
 
-    own, oldest = jax.vmap(lives)(jax.random.split(jax.random.key(7), 24))
-    assert own.mean() > 1.12 * oldest.mean()
+    shipped, oldest_first = jax.vmap(lifetimes)(jax.random.split(jax.random.key(7), 24))
+    assert shipped.mean() > 1.12 * oldest_first.mean()
 
 
 @pytest.mark.slow
-def test_a_first_failure_is_foretold(generalist):
-    """The forecast of one town holds on other futures of it."""
+def test_the_forecast_holds_on_other_futures(generalist):
     params, layout = um.Params(), um.sample_layout(jax.random.key(11), um.Params(), 4, 8)
     advice = um.planning.advise(generalist, params, layout, samples=64)
     state, keys = um.initial_state(params, layout), jax.random.split(jax.random.key(5), 64)
     played = jax.jit(jax.vmap(lambda key: rollout_from(generalist, params, layout, state, key)))(keys)
     share = np.asarray(played.first_failure).mean(axis=0)
-    assert np.abs(share - advice.first_failure).max() < 0.45
-    assert abs(np.asarray(played.length).mean() - advice.lifetimes.mean()) < 1.5
+    assert np.abs(share - advice.forecast.first_failure).max() < 0.45
+    assert abs(np.asarray(played.length).mean() - advice.forecast.lifetimes.mean()) < 1.5
 
 
-def test_an_altered_file_is_refused(tmp_path, generalist):
+def test_an_altered_policy_file_is_refused(tmp_path, generalist):
     from uavmec_jax.scenarios.policies import _SHIPPED
 
     content = bytearray((_SHIPPED / "generalist.npz").read_bytes())
@@ -179,7 +176,7 @@ def test_an_altered_file_is_refused(tmp_path, generalist):
         load_policy(tmp_path / "mine.npz")
 
 
-def test_a_file_with_other_features_is_refused(tmp_path, monkeypatch, generalist):
+def test_a_policy_file_with_other_features_is_refused(tmp_path, monkeypatch, generalist):
     from uavmec_jax.scenarios import policy_files as collection
 
     generalist.save(tmp_path / "mine.npz")

@@ -1,6 +1,8 @@
-"""The commands about runs: what they refuse, and what they say."""
+"""The commands about runs: what they print and what they refuse."""
 
 import json
+import signal
+import sys
 
 import pytest
 from click.testing import CliRunner
@@ -8,6 +10,7 @@ from click.testing import CliRunner
 from tests.runs.processes import TINY
 from uavmec_jax.cli import main
 from uavmec_jax.runs.shared_run import prepare_run
+from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.study import parse_study
 
 
@@ -18,33 +21,47 @@ def planned(tmp_path_factory):
     return directory
 
 
-def test_status_of_a_run_that_nobody_has_started(planned):
-    said = CliRunner().invoke(main, ["status", str(planned)]).stdout
-    assert "not complete, 4 agents" in said
-    assert "shards: 2 waiting" in said
-    assert "steps: 0 of 16,000 (0%)" in said
-    assert f"nobody is at work; go on with: uavmec resume {planned}" in said
-    told = json.loads(CliRunner().invoke(main, ["status", str(planned), "--json"]).stdout)
-    assert (told["steps"], told["total_steps"], told["seconds_left"]) == (0, 16_000, None)
-    assert told["disk_bytes"] > 1000
+def test_status_of_a_run_that_has_not_been_started(planned):
+    output = CliRunner().invoke(main, ["status", str(planned)]).stdout
+    assert "not complete, 4 agents" in output
+    assert "shards: 2 waiting" in output
+    assert "steps: 0 of 16,000 (0%)" in output
+    assert f"uavmec resume {planned}" in output
+    status = json.loads(CliRunner().invoke(main, ["status", str(planned), "--json"]).stdout)
+    assert (status["steps"], status["total_steps"], status["seconds_left"]) == (0, 16_000, None)
+    assert status["shards"] == {"waiting": 2, "running": 0, "stopped": 0, "failed": 0, "done": 0}
+    assert status["disk_bytes"] > 1000
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_ends_with_the_exit_code_of_its_signal(planned, monkeypatch, number):
+    study = parse_study(TINY, "tiny")
+    stopped = Results(study, {"complete": False, "agents": 4, "stopped_by": int(number)})
+    monkeypatch.setattr("uavmec_jax.runs.run.resume_run", lambda *_, **__: stopped)
+    done = CliRunner().invoke(main, ["resume", str(planned)])
+    assert done.exit_code == 128 + number
+    assert done.stderr == f"interrupted: 0 of 4 agents are finished; resume with: uavmec resume {planned}\n"
 
 
 def test_simulate():
     options = ["--seeds", "30", "--simulate", "--speed", "100000", "--devices", "2", "--json"]
-    told = json.loads(CliRunner().invoke(main, ["run", "table5", *options]).stdout)
-    assert told["training_s"] == pytest.approx(750 * 1_000_000 / 200_000, rel=0.1)
-    assert told["wall_s"] > told["training_s"]
-    assert 4 * 2**30 < told["memory_bytes"] < 12 * 2**30
+    estimate = json.loads(CliRunner().invoke(main, ["run", "table5", *options]).stdout)
+    assert estimate["training_s"] == pytest.approx(750 * 1_000_000 / 200_000, rel=0.1)
+    assert estimate["wall_s"] > estimate["training_s"]
+    assert 4 * 2**30 < estimate["memory_bytes"] < 12 * 2**30
 
 
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        (["resume", "."], "uavmec: .: holds no run that can be resumed (plan.json is not there)"),
+        (["resume", "."], "uavmec: .: holds no run that can be resumed (run_plan.json is missing)"),
         (["status", "nowhere"], "uavmec: nowhere: holds no run that can be resumed"),
         (["worker", "."], "uavmec: .: holds no run that can be resumed"),
         (["worker", ".", "--share", "3/2"], "uavmec: --share 3/2: give I/N, e.g. 1/2"),
-        (["run", "table5", "--simulate"], "uavmec: --simulate needs --speed"),
+        (
+            ["run", "table5", "--simulate"],
+            "uavmec: --simulate needs --speed, the training steps per second of one device",
+        ),
         (["run", "table5", "--set", "axes.seeds=40_000_000"], "uavmec: table5: 1,000,000,000 agents need 93,132 GiB"),
         (["search", "nowhere"], "uavmec: nowhere: neither a file of a search space nor a shipped one; known: dqn"),
         (["search", "dqn", "--out", "."], "uavmec: .: is not empty and holds no search"),
@@ -76,7 +93,7 @@ def test_bad_input_is_one_line_and_exit_code_2(tmp_path, monkeypatch, arguments,
 def test_a_missing_extra_is_named(tmp_path, monkeypatch, module, arguments, line):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "tiny.toml").write_text(TINY)
-    monkeypatch.setitem(__import__("sys").modules, module, None)
+    monkeypatch.setitem(sys.modules, module, None)
     done = CliRunner().invoke(main, arguments)
     assert done.exit_code == 2, done.output
     assert line in done.stderr

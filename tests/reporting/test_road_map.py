@@ -14,15 +14,15 @@ from uavmec_jax.planning.heuristics import HEURISTICS
 from uavmec_jax.reporting.animation import save_animation
 from uavmec_jax.reporting.canvas import new_figure, save
 from uavmec_jax.reporting.evacuation import evacuation_data, evacuation_lines
-from uavmec_jax.reporting.road_map import COLOURS, LIMITS, colour_of, draw_roads, map_figure
+from uavmec_jax.reporting.road_map import COLOURS, LIMITS, colours_of, draw_roads, map_figure
 from uavmec_jax.scenarios.places import on_place
 from uavmec_jax.traffic.evacuation import load_evacuation
 
 
 def test_seven_colours_in_the_papers_order():
     assert COLOURS == ("blue", "cyan", "yellow", "green", "orange", "red", "magenta")
-    assert colour_of(np.array([0.0, *LIMITS])) == list(COLOURS)
-    assert colour_of(np.array([1.99, 59.9])) == ["blue", "red"]
+    assert colours_of(np.array([0.0, *LIMITS])) == list(COLOURS)
+    assert colours_of(np.array([1.99, 59.9])) == ["blue", "red"]
 
 
 def test_the_densest_roads_are_drawn_on_top_in_their_colours():
@@ -40,7 +40,7 @@ def test_map_of_a_shipped_place(tmp_path):
     assert (tmp_path / "map.png").stat().st_size > 20_000
 
 
-def test_words_and_data():
+def test_lines_and_data():
     lines = evacuation_lines(evacuation())
     assert any("1 had not left" in line for line in lines)
     assert any(line.startswith("1 residential roads have no way") for line in lines)
@@ -59,5 +59,5 @@ def test_animation_has_a_frame_for_each_slot(tmp_path):
     assert slots >= 10
     with Image.open(path) as image:
         assert image.is_animated
-        assert slots <= image.n_frames <= slots + 4  # the end stays a while; equal frames are kept as one
+        assert slots <= image.n_frames <= slots + 4  # the last frame is held; equal frames are kept as one
     assert [file.name for file in tmp_path.iterdir()] == ["evacuation.gif"]

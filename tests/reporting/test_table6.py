@@ -1,4 +1,4 @@
-"""The paper's Table 6 from results: numbers in their places."""
+"""The paper's Table 6 from results."""
 
 import io
 
@@ -17,21 +17,21 @@ from uavmec_jax.studies.study import load_study
 
 @pytest.fixture(scope="module")
 def results():
-    """Every agent of the shipped study with an invented life: PPO on "A" in 8/8 lives 21 to 25 slots, all others 12."""
+    """All agents of the shipped study with invented lifetimes: 21 to 25 slots for PPO on "A" in 8/8, 12 for the others."""
     study = load_study("table6")
     agents = pd.DataFrame(make_agent_ids(study))
     chosen = (agents.algorithm == "ppo") & (agents.reward == "A") & (agents.powered == 8)
     lifetime = np.where(chosen, 21.0 + agents.seed, 12.0)
     columns = {}
-    for policy, less in (("best", 0.0), ("last", 1.0), ("oldest_first", 2.0)):
-        columns |= {f"{policy}_lifetime": lifetime - less, f"{policy}_lifetime_fixed": lifetime - less}
+    for policy, behind in (("best", 0.0), ("last", 1.0), ("oldest_first", 2.0)):
+        columns |= {f"{policy}_lifetime": lifetime - behind, f"{policy}_lifetime_fixed": lifetime - behind}
     share = np.zeros((len(agents), 2, 12), np.float32)
     evaluation = {f"{policy}/first_failure": share for policy in ("best", "last", "oldest_first")}
     curves = {"dqn": {"chunk_steps": np.arange(2)}}
     return Results(study=study, run={}, agents=agents.assign(**columns), curves=curves, evaluation=evaluation)
 
 
-def test_each_place_is_a_table_like_the_papers(results):
+def test_each_pair_of_counts_is_a_table_like_the_papers(results):
     assert is_table6(results)
     shown = tables(results)
     titles = list(shown)
@@ -45,13 +45,13 @@ def test_each_place_is_a_table_like_the_papers(results):
     console = Console(width=120, record=True, file=io.StringIO())
     console.print(table)
     text = console.export_text()
-    for words in ("23.0 ±1.2", "25.0 / 19", "22.0 ±1.2"):  # mean of 21 to 25, longest / paper's A, PPO, 8/8, last
-        assert words in text
+    for entry in ("23.0 ±1.2", "25.0 / 19", "22.0 ±1.2"):  # mean of 21 to 25, longest / paper's A, PPO, 8/8, last
+        assert entry in text
     assert "12.0 / 28" in text  # the paper's DQN on U+log(A/O)
     assert "U+log(A/O)  (log1p)" in text
 
 
-def test_rewards_under_a_second_guard_say_so(results):
+def test_rewards_under_a_second_guard_name_it(results):
     labels = label_rewards(results.cells())
     assert sum("(log1p)" in label for label in labels) == 4 * 9
     assert "A" in labels
@@ -62,7 +62,7 @@ def test_figure(results, tmp_path):
     assert (tmp_path / "figure.png").stat().st_size > 20_000
 
 
-def test_an_interrupted_run_has_holes(results):
+def test_an_interrupted_run_has_empty_entries(results):
     part = Results(
         study=results.study,
         run={},

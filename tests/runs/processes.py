@@ -1,12 +1,13 @@
 """Small studies, and runs of them in processes of their own."""
 
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
 FINAL = ("agents.csv", "curves.npz", "evaluation.npz", "weights.npz", "study.toml")
-"""Files whose bits do not hang on when and how often a run was stopped."""
+"""Files that are the same to the bit, however often a run was stopped."""
 
 TINY = """
 name = "tiny"
@@ -26,18 +27,18 @@ baselines = ["oldest-first"]
 """
 
 
-class Enough(KeyboardInterrupt):
-    """Somebody presses Ctrl-C."""
+class CtrlC(KeyboardInterrupt):
+    """The user presses Ctrl-C."""
 
 
 def stop_after(chunks):
-    """Told of progress, interrupts after so many chunks."""
-    told = []
+    """Return an ``on_progress`` that interrupts the run after so many chunks."""
+    calls = []
 
-    def on_progress(news):
-        told.append(news)
-        if len(told) == chunks:
-            raise Enough
+    def on_progress(progress):
+        calls.append(progress)
+        if len(calls) == chunks:
+            raise CtrlC
 
     return on_progress
 
@@ -71,8 +72,6 @@ def bits(directory: Path) -> dict[str, bytes]:
 
 
 def events(directory: Path, kind: str) -> list[dict]:
-    """What the workers of a run have logged of one kind."""
-    import json
-
+    """The events of one kind that the workers of a run have logged."""
     lines = [line for file in sorted((directory / "log").glob("*.jsonl")) for line in file.read_text().splitlines()]
     return [event for event in map(json.loads, lines) if event["event"] == kind]

@@ -1,4 +1,4 @@
-"""Runs that are killed, stopped, interrupted, and that run out of disk: they go on and end with the same bits."""
+"""Runs that are killed, stopped, or run out of disk space: resumed, they end with the same bits."""
 
 import json
 import random
@@ -32,7 +32,7 @@ def folder(tmp_path_factory):
     return folder
 
 
-def test_the_uninterrupted_run_takes_snapshots_and_tidies_up(folder):
+def test_an_uninterrupted_run_writes_checkpoints_and_removes_them(folder):
     run = json.loads((folder / "whole" / "run.json").read_text())
     assert run["seconds"]["checkpoint"] > 0
     assert len(events(folder / "whole", "checkpoint")) >= 2
@@ -40,7 +40,7 @@ def test_the_uninterrupted_run_takes_snapshots_and_tidies_up(folder):
 
 
 def test_killed_twenty_times_it_ends_with_the_same_bits(folder):
-    """SIGKILL at random opt_state: while it starts, trains, writes a checkpoint, judges, puts the results together."""
+    """SIGKILL at random moments: while it starts, trains, writes a checkpoint, evaluates, assembles the results."""
     chance = random.Random(5)
     kills, runs, restored = 0, 0, 0
     while kills < KILLS:
@@ -55,7 +55,7 @@ def test_killed_twenty_times_it_ends_with_the_same_bits(folder):
                     process.kill()
                     kills += 1
             _, errors = process.communicate(timeout=120)
-            if (out / "plan.json").exists():
+            if (out / "run_plan.json").exists():
                 arguments = ["resume", out.name]
             if process.returncode != -signal.SIGKILL:
                 assert process.returncode == 0, errors
@@ -67,34 +67,35 @@ def test_killed_twenty_times_it_ends_with_the_same_bits(folder):
 
 
 def wait_for_a_moment(chance, process, out):
-    """One while it starts, or one of its work, which is found by what the run tells: machines differ in speed."""
+    """Wait for a random time, or for a random number of events: machines differ in speed."""
     if chance.random() < 0.6:
         time.sleep(chance.uniform(0.0, 2.0))
         return
-    told = lines_told(out) + chance.randint(1, 300)
-    while lines_told(out) < told and process.poll() is None:
+    target = logged_lines(out) + chance.randint(1, 300)
+    while logged_lines(out) < target and process.poll() is None:
         time.sleep(0.01)
     if chance.random() < 0.3:
         time.sleep(chance.uniform(0.0, 4.0))
 
 
-def lines_told(out):
+def logged_lines(out):
     return sum(file.read_bytes().count(b"\n") for file in (out / "log").glob("*.jsonl"))
 
 
-def test_told_to_stop_it_keeps_all_and_says_how_to_go_on(folder):
-    process = start("run", "tiny.toml", *TRAINED_LONG, "--checkpoint-every", "3600", "--out", "told", cwd=folder)
-    wait_for(lambda: len(events(folder / "told", "chunk")) > 20, process)
+def test_sigterm_writes_a_checkpoint_and_says_how_to_resume(folder):
+    process = start("run", "tiny.toml", *TRAINED_LONG, "--checkpoint-every", "3600", "--out", "ended", cwd=folder)
+    wait_for(lambda: len(events(folder / "ended", "chunk")) > 20, process)
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 143
-    assert "go on with: uavmec resume told" in errors
-    (kept,) = events(folder / "told", "checkpoint")
-    assert events(folder / "told", "chunk")[-1]["steps"] == kept["steps"]
-    uavmec("resume", "told", cwd=folder)
-    (restored,) = events(folder / "told", "restored")
-    assert restored["steps"] == kept["steps"]
-    assert bits(folder / "told") == bits(folder / "whole")
+    assert "interrupted: 0 of 4 agents are finished; resume with: uavmec resume ended" in errors
+    (checkpoint,) = events(folder / "ended", "checkpoint")
+    assert checkpoint["file"] == "checkpoint-000001.npz"
+    assert events(folder / "ended", "chunk")[-1]["steps"] == checkpoint["steps"]
+    uavmec("resume", "ended", cwd=folder)
+    (restored,) = events(folder / "ended", "restored")
+    assert restored["steps"] == checkpoint["steps"]
+    assert bits(folder / "ended") == bits(folder / "whole")
 
 
 def test_a_workers_shard_is_finished_by_another(folder):
@@ -110,30 +111,30 @@ def test_a_workers_shard_is_finished_by_another(folder):
     assert team[1].returncode == 0, errors
     assert "complete" in output
     claims = events(folder / "team", "claimed")
-    assert [told["taken_over"] for told in claims].count(True) == 1
-    assert sorted(told["shard"] for told in events(folder / "team", "done")) == [0, 1]
+    assert [claim["taken_over"] for claim in claims].count(True) == 1
+    assert sorted(event["shard"] for event in events(folder / "team", "done")) == [0, 1]
     assert bits(folder / "team") == bits(folder / "whole")
 
 
 def test_workers_of_one_command(folder):
     process = start("run", "tiny.toml", *TRAINED_LONG, "--workers", "2", "--out", "two", cwd=folder)
     wait_for(lambda: len(events(folder / "two", "claimed")) == 2, process)
-    told = json.loads(CliRunner().invoke(main, ["status", str(folder / "two"), "--json"]).stdout)
-    assert told["shards"]["running"] == 2
-    assert len(told["workers"]) == 2
+    status = json.loads(CliRunner().invoke(main, ["status", str(folder / "two"), "--json"]).stdout)
+    assert status["shards"]["running"] == 2
+    assert len(status["workers"]) == 2
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 143, errors
-    said = CliRunner().invoke(main, ["status", str(folder / "two")]).stdout
-    assert "2 stopped" in said
-    assert "nobody is at work; go on with: uavmec resume" in said
+    output = CliRunner().invoke(main, ["status", str(folder / "two")]).stdout
+    assert "2 stopped" in output
+    assert "uavmec resume" in output
 
 
 def test_workers_of_a_cluster(folder):
     """submitit's executor for this machine stands in for SLURM's."""
     options = ["--jobs", "2", "--executor", "local", "--set", "steps=4000", "--with", "timeout_min=5"]
-    said = uavmec("submit", "tiny.toml", *options, "--out", "jobs", cwd=folder).stdout
-    assert "2 workers submitted" in said
+    output = uavmec("submit", "tiny.toml", *options, "--out", "jobs", cwd=folder).stdout
+    assert "2 workers submitted" in output
     deadline = time.monotonic() + 120
     while not run_status(folder / "jobs").complete:
         assert time.monotonic() < deadline
@@ -144,8 +145,8 @@ def test_workers_of_a_cluster(folder):
     assert "--executor slum" in wrong.stderr
 
 
-def test_a_full_disk_is_said_and_the_snapshot_before_is_used(folder):
-    """A limit on the size of files stands in for it: the log and small files fit, a checkpoint does not."""
+def test_a_full_disk_is_reported_and_the_checkpoint_before_is_used(folder):
+    """A limit on the size of files stands in for a full disk: the log and small files fit, a checkpoint does not."""
     out = "full"
     often = ["--checkpoint-share", "0.5"]
     process = start("run", "tiny.toml", *TRAINED_LONG, *often, "--out", out, cwd=folder)

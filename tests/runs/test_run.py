@@ -1,8 +1,9 @@
-"""Whole runs: what they leave, and that it can be read back."""
+"""Whole runs: the files that they leave, and that these can be read back."""
 
 import json
 import shutil
 
+import chex
 import numpy as np
 import pandas as pd
 import pytest
@@ -16,6 +17,7 @@ from uavmec_jax.runs.run_plan import BYTES_WITHOUT_TRAINING, plan_run
 from uavmec_jax.studies.results_files import load_weights
 from uavmec_jax.studies.study import parse_study
 from uavmec_jax.training import host
+from uavmec_jax.training.training import Trainer
 
 TOML = """
 name = "tiny"
@@ -50,7 +52,7 @@ def test_files_of_a_run(finished):
         "curves.npz",
         "evaluation.npz",
         "weights.npz",
-        "plan.json",
+        "run_plan.json",
         "log",
     }
     run = json.loads((directory / "run.json").read_text())
@@ -58,6 +60,8 @@ def test_files_of_a_run(finished):
     assert run["command"] == "uavmec run tiny.toml"
     assert run["seeds"] == [0, 1]
     assert run["environment_steps"] == 8 * 600
+    assert run["schema"] == 3
+    assert run["partitions"]["dqn"].keys() == {"shards", "shard_size", "groups", "shard_bytes"}
     assert run["versions"]["jax"]
     assert run["training_steps_per_second"] > 0
 
@@ -81,10 +85,7 @@ def test_read_back_equals_what_was_run(finished):
     again = load_results(directory)
     assert again.study == results.study
     pd.testing.assert_frame_equal(again.agents, results.agents, check_dtype=False, rtol=1e-5)
-    for mine, theirs in ((results.curves["dqn"], again.curves["dqn"]), (results.evaluation, again.evaluation)):
-        assert mine.keys() == theirs.keys()
-        for name in mine:
-            assert_array_equal(mine[name], theirs[name])
+    chex.assert_trees_all_equal((again.curves, again.evaluation), (results.curves, results.evaluation))
     assert results.curves["dqn"]["validation"].shape == (8, 3)
     assert results.evaluation["best/lifetime"].shape == (8, 6)
     kernel = load_weights(directory)["params"]["TorchDense_0"]["kernel"]
@@ -139,9 +140,9 @@ def test_planners_play_the_same_draws_and_the_bound_holds(finished):
     bound = results.evaluation["bound/lifetime"]
     assert bound.shape == results.evaluation["rollout/lifetime"].shape == (8, 2)
     for policy in (*results.policies, "rollout", "beam"):
-        lives = results.evaluation[f"{policy}/lifetime"][:, :2]
-        assert (lives <= bound).all(), policy
-        assert_array_equal(results.agents[f"{policy}_planned"], lives.mean(axis=1))
+        lifetimes = results.evaluation[f"{policy}/lifetime"][:, :2]
+        assert (lifetimes <= bound).all(), policy
+        assert_array_equal(results.agents[f"{policy}_planned"], lifetimes.mean(axis=1))
     assert results.gaps == [("rollout", "best"), ("beam", "rollout"), ("bound", "beam")]
     cells = results.cells()
     difference = results.agents["beam_planned"] - results.agents["rollout_planned"]
@@ -150,7 +151,7 @@ def test_planners_play_the_same_draws_and_the_bound_holds(finished):
     for _, cell in cells.iterrows():
         percent = tables.gap_percent(results, cell)["bound_over_beam"]
         assert percent == pytest.approx(100 * (cell["bound_planned"] / cell["beam_planned"] - 1))
-    # Stay put with everything powered and connected is the best there is, and the planners find it.
+    # Staying put is optimal if every device is powered and connected, and the planners find it.
     rich = results.agents.query("powered == 12 and connected == 12")
     assert (rich["beam_planned"] >= 33).all()
 
@@ -169,7 +170,7 @@ def test_a_study_that_trains_nothing(tmp_path):
         "run.json",
         "agents.csv",
         "evaluation.npz",
-        "plan.json",
+        "run_plan.json",
         "log",
     }
     again = load_results(tmp_path / "none")
@@ -187,34 +188,43 @@ def test_the_figure_of_heuristics_alone(powered):
         assert figures.run_figure(run_study(parse_study(TOML, "tiny", changes | axes)))
 
 
+compile_trainer = Trainer.compile
+
+
 def leave_room_for(agents, study, monkeypatch):
     """Pretend that the host has memory for so many agents in training."""
     plan = plan_run(study)
-    free = BYTES_WITHOUT_TRAINING * plan.agents + agents * plan.blocks["dqn"].bytes // plan.blocks["dqn"].size
+    partition = plan.partitions["dqn"]
+    free = BYTES_WITHOUT_TRAINING * plan.agents + agents * partition.shard_bytes // partition.shard_size
     monkeypatch.setattr(host, "free_memory", lambda: free)
 
 
 @pytest.mark.slow
-def test_blocks_one_after_the_other_give_every_agent_once(finished, monkeypatch):
+def test_shards_one_after_the_other_give_every_agent_once_and_compile_once(finished, monkeypatch):
     study = finished[0].study
     study = study.model_copy(update={"evaluation": study.evaluation.model_copy(update={"planners": ()})})
     leave_room_for(2, study, monkeypatch)
     assert len(plan_run(study).shards) == 4
-    pieces = run_study(study)
-    assert pieces.run["complete"]
-    pd.testing.assert_frame_equal(pieces.agents.iloc[:, :3], finished[0].agents.iloc[:, :3])
-    assert_array_equal(pieces.evaluation["oldest_first/lifetime"], finished[0].evaluation["oldest_first/lifetime"])
-    assert pieces.curves["dqn"]["validation"].shape == (8, 3)
+    compiled = []
+    monkeypatch.setattr(
+        Trainer, "compile", lambda *arguments: compiled.append(arguments) or compile_trainer(*arguments)
+    )
+    results = run_study(study)
+    assert len(compiled) == 1
+    assert results.run["complete"]
+    pd.testing.assert_frame_equal(results.agents.iloc[:, :3], finished[0].agents.iloc[:, :3])
+    assert_array_equal(results.evaluation["oldest_first/lifetime"], finished[0].evaluation["oldest_first/lifetime"])
+    assert results.curves["dqn"]["validation"].shape == (8, 3)
 
 
 @pytest.mark.slow
-def test_interrupted_run_keeps_the_finished_blocks(finished, monkeypatch, tmp_path):
+def test_an_interrupted_run_keeps_the_finished_shards(finished, monkeypatch, tmp_path):
     study = parse_study(TOML, "tiny", {"evaluation.planners": [], "evaluation.baselines": []})
     leave_room_for(4, study, monkeypatch)
     assert len(plan_run(study).shards) == 2
 
     def interrupt(progress):
-        if progress.block == 1:
+        if progress.shard == 1:
             raise KeyboardInterrupt
 
     results = run_study(study, tmp_path / "half", on_progress=interrupt)
@@ -263,37 +273,27 @@ def test_flipped_bit_in_the_weights_is_found(finished, tmp_path):
         load_weights(damage(finished[1], tmp_path, "weights.npz", flip))
 
 
-def test_newer_schema_and_no_run(finished, tmp_path):
-    newer = damage(finished[1], tmp_path, "run.json", lambda data: data.replace(b'"schema": 2', b'"schema": 99'))
-    with pytest.raises(StudyError, match="schema is 99; this version reads up to 2"):
-        load_results(newer)
-    with pytest.raises(StudyError, match="holds no run"):
-        load_results(tmp_path)
+@pytest.mark.parametrize("schema", [1, 2, 4, 99])
+def test_another_schema_is_refused(finished, tmp_path, schema):
+    def change(data):
+        return data.replace(b'"schema": 3', f'"schema": {schema}'.encode())
+
+    with pytest.raises(StudyError, match=rf"run.json: schema is {schema}; this version reads 3$"):
+        load_results(damage(finished[1], tmp_path, "run.json", change))
 
 
-def test_a_run_of_schema_1_can_be_read(finished, tmp_path):
-    older = damage(finished[1], tmp_path, "run.json", lambda data: data.replace(b'"schema": 2', b'"schema": 1'))
-    run = json.loads((older / "run.json").read_text())
-    del run["sha256"]
-    (older / "run.json").write_text(json.dumps(run))
-    with np.load(older / "curves.npz") as curves:
-        np.savez(older / "curves.npz", **{name.removeprefix("dqn/"): curves[name] for name in curves.files})
-    again = load_results(older)
-    assert_array_equal(again.curves["dqn"]["validation"], finished[0].curves["dqn"]["validation"])
-
-
-def test_stopped_and_resumed_it_is_equal_to_the_bit(finished, tmp_path):
+def test_stopped_and_resumed_the_results_are_equal_to_the_bit(finished, tmp_path):
     results, directory = finished
 
-    def stop(news):
-        if news.steps >= 8 * 300:
+    def stop(progress):
+        if progress.steps >= 8 * 300:
             raise KeyboardInterrupt
 
     half = run_study(results.study, tmp_path / "half", on_progress=stop)
     assert (half.run["complete"], half.run["stopped_by"], len(half.agents)) == (False, 2, 0)
-    told = []
-    again = resume_run(tmp_path / "half", on_event=lambda event, facts: told.append((event, facts)))
-    assert [facts["steps"] for event, facts in told if event == "restored"] == [300]
+    events = []
+    again = resume_run(tmp_path / "half", on_event=lambda event, facts: events.append((event, facts)))
+    assert [facts["steps"] for event, facts in events if event == "restored"] == [300]
     for name in ("agents.csv", "curves.npz", "evaluation.npz", "weights.npz"):
         assert (tmp_path / "half" / name).read_bytes() == (directory / name).read_bytes()
     assert np.isfinite(again.agents["best_lifetime"]).all()

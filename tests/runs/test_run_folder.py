@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 import uavmec_jax as um
-from tests.runs.processes import FINAL, TINY, Enough, bits, events, stop_after
+from tests.runs.processes import FINAL, TINY, CtrlC, bits, events, stop_after
 from uavmec_jax.errors import StudyError
 from uavmec_jax.runs import folder as folders
 from uavmec_jax.runs import run as running
-from uavmec_jax.runs.folder import RunFolder, RunOptions
+from uavmec_jax.runs.folder import RunFolder
+from uavmec_jax.runs.options import RunOptions
 from uavmec_jax.runs.results_folder import load_results
 from uavmec_jax.runs.run import resume_run, run_study
 from uavmec_jax.runs.shared_run import prepare_run, work_on
@@ -58,7 +59,7 @@ def checkpoints(directory):
     return sorted((directory / "shards" / "00001").glob("checkpoint-*.npz"))
 
 
-def test_stopped_anywhere_it_ends_with_the_same_bits(whole, stopped, tmp_path):
+def test_a_stopped_run_is_resumed_with_the_same_bits(whole, stopped, tmp_path):
     directory = copied(stopped, tmp_path)
     assert len(checkpoints(directory)) == 2
     results = resume_run(directory)
@@ -68,30 +69,25 @@ def test_stopped_anywhere_it_ends_with_the_same_bits(whole, stopped, tmp_path):
     assert resume_run(directory).run["complete"]  # nothing is left to do
 
 
-def test_what_is_finished_can_be_shown_before_the_rest(whole, stopped):
+def test_finished_shards_can_be_shown_before_the_rest(stopped):
     results = load_results(stopped)
     assert (len(results.agents), results.run["complete"]) == (2, False)
-    assert results.agents.equals(load_results_exact(whole).agents[:2])
-
-
-def load_results_exact(directory):
-    """The agents as the shards have them, before they are rounded in the table."""
-    return run_study(STUDY, shard_size=2)
+    assert results.agents.equals(run_study(STUDY, shard_size=2).agents[:2])  # not rounded as in the table
 
 
 @pytest.mark.parametrize("damage", [flip, lambda path: path.write_bytes(path.read_bytes()[:-900])], ids=["bit", "end"])
-def test_a_damaged_snapshot_is_named_and_the_one_before_is_used(whole, stopped, tmp_path, damage):
+def test_a_damaged_checkpoint_is_reported_and_the_one_before_is_used(whole, stopped, tmp_path, damage):
     directory = copied(stopped, tmp_path)
     older, newest = checkpoints(directory)
     damage(newest)
     resume_run(directory)
-    (told,) = events(directory, "damaged")
-    assert told["file"] == newest.name
+    (event,) = events(directory, "damaged")
+    assert event["file"] == newest.name
     assert events(directory, "restored")[-1]["file"] == older.name
     assert bits(directory) == bits(whole)
 
 
-def test_without_a_sound_snapshot_the_shard_starts_again(whole, stopped, tmp_path):
+def test_without_an_intact_checkpoint_the_shard_starts_again(whole, stopped, tmp_path):
     directory = copied(stopped, tmp_path)
     before = len(events(directory, "restored"))
     for path in checkpoints(directory):
@@ -102,36 +98,36 @@ def test_without_a_sound_snapshot_the_shard_starts_again(whole, stopped, tmp_pat
     assert bits(directory) == bits(whole)
 
 
-def test_a_snapshot_of_another_shard_or_run_is_not_used(whole, stopped, tmp_path):
+def test_a_checkpoint_of_another_shard_or_run_is_not_used(whole, stopped, tmp_path):
     directory = copied(stopped, tmp_path)
     other = tmp_path / "other"
     run_study(STUDY, other, command="y", shard_size=2, options=OFTEN, on_progress=stop_after(4))
     (foreign, *_) = sorted((other / "shards" / "00000").glob("checkpoint-*.npz"))
     shutil.copy(foreign, checkpoints(directory)[-1])
     resume_run(directory)
-    assert "is of another run" in events(directory, "damaged")[0]["error"]
+    assert "belongs to another run" in events(directory, "damaged")[0]["error"]
     assert bits(directory) == bits(whole)
 
 
 @pytest.mark.parametrize("damage", [flip, lambda path: path.write_bytes(path.read_bytes()[:100])], ids=["bit", "end"])
-def test_a_damaged_result_is_named_and_made_again(whole, stopped, tmp_path, damage):
+def test_a_damaged_result_is_reported_and_the_shard_runs_again(whole, stopped, tmp_path, damage):
     directory = copied(stopped, tmp_path)
     damage(directory / "shards" / "00000" / "result.npz")
     with pytest.raises(StudyError, match=r"00000/result.npz: (cannot be read|was altered|is not a finished)"):
         load_results(directory)
     resume_run(directory)
-    assert [(told["shard"], told["file"]) for told in events(directory, "damaged")] == [(0, "result.npz")]
+    assert [(event["shard"], event["file"]) for event in events(directory, "damaged")] == [(0, "result.npz")]
     assert bits(directory) == bits(whole)
 
 
 @pytest.mark.parametrize(
     ("name", "line"),
     [
-        ("plan.json", r"plan\.json: (cannot be read|was altered)"),
+        ("run_plan.json", r"run_plan\.json: (cannot be read|was altered)"),
         ("study.toml", r"study\.toml: was altered or damaged"),
     ],
 )
-def test_a_damaged_plan_is_refused(stopped, tmp_path, name, line):
+def test_a_damaged_run_plan_is_refused(stopped, tmp_path, name, line):
     directory = copied(stopped, tmp_path)
     path = directory / name
     path.write_bytes(path.read_bytes().replace(b"4000" if name == "study.toml" else b'"agents": 4', b"4001", 1))
@@ -144,13 +140,13 @@ def test_damaged_logs_and_leases_do_no_harm(whole, stopped, tmp_path):
     directory = copied(stopped, tmp_path)
     for path in [*(directory / "log").iterdir(), *(directory / "shards").rglob("lease-*.json")]:
         path.write_bytes(path.read_bytes()[:20])
-    path = directory / "plan.json"
+    path = directory / "run_plan.json"
     facts = json.loads(path.read_text())
     facts["options"]["lease_s"] = 0.5
     facts["sha256"] = folders._digest(facts)
     path.write_text(json.dumps(facts))
     for checkpoint in checkpoints(directory):
-        checkpoint.unlink()  # they are of the plan as it was
+        checkpoint.unlink()  # they belong to the original plan
     resume_run(directory)
     assert bits(directory) == bits(whole)
 
@@ -165,47 +161,47 @@ def test_a_flipped_bit_in_the_results_is_found(whole, tmp_path, name):
         load_results(directory)
 
 
-def test_a_newer_schema_is_refused(stopped, tmp_path):
+def test_another_schema_of_the_run_plan_is_refused(stopped, tmp_path):
     directory = copied(stopped, tmp_path)
-    path = directory / "plan.json"
+    path = directory / "run_plan.json"
     path.write_text(path.read_text().replace('"schema": 1', '"schema": 7', 1))
-    with pytest.raises(StudyError, match=r"plan.json: schema is 7; this version reads 1"):
+    with pytest.raises(StudyError, match=r"run_plan.json: schema is 7; this version reads 1"):
         resume_run(directory)
 
 
-def test_other_code_is_refused_unless_it_is_wanted(whole, stopped, tmp_path, monkeypatch):
+def test_other_code_is_refused_unless_it_is_allowed(whole, stopped, tmp_path, monkeypatch):
     directory = copied(stopped, tmp_path)
     monkeypatch.setattr(folders.host, "code_digest", lambda: "0123456789abcdef")
-    with pytest.raises(StudyError, match=r"was planned by other code \(uavmec_jax's code \w+ -> 0123456789ab\)"):
+    with pytest.raises(StudyError, match=r"was planned with other code \(uavmec_jax's code \w+ -> 0123456789ab\)"):
         resume_run(directory)
     results = resume_run(directory, other_code=True)
     assert results.run["other_code"]
     assert bits(directory) == bits(whole)
 
 
-def test_a_second_process_is_refused_and_told_who_is_there(tmp_path):
-    said = []
+def test_a_second_process_is_refused_with_the_name_of_the_first(tmp_path):
+    messages = []
 
     def second(_):
         for attempt in (lambda: resume_run(tmp_path / "run"), lambda: run_study(STUDY, tmp_path / "run")):
             with pytest.raises(StudyError) as refused:
                 attempt()
-            said.append(str(refused.value))
-        raise Enough
+            messages.append(str(refused.value))
+        raise CtrlC
 
     run_study(STUDY, tmp_path / "run", on_progress=second)
-    assert len(said) == 2
-    for line in said:
+    assert len(messages) == 2
+    for line in messages:
         assert re.search(r"run: process \d+ on \S+ is at work in it; to help it, start `uavmec worker .*run`", line)
 
 
-def test_workers_share_a_run_and_the_last_one_puts_it_together(whole, tmp_path):
+def test_workers_share_a_run_and_the_last_one_assembles_the_results(whole, tmp_path):
     prepare_run(STUDY, tmp_path / "run", command="x", shard_size=2)
     assert run_status(tmp_path / "run").shards["waiting"] == 2
     assert work_on(tmp_path / "run")
     assert bits(tmp_path / "run") == bits(whole)
     assert run_status(tmp_path / "run").complete
-    assert work_on(tmp_path / "run")  # one that comes late finds nothing to do
+    assert work_on(tmp_path / "run")  # a late worker finds nothing to do
 
 
 def test_a_shard_that_fails_does_not_stop_the_others(whole, tmp_path, monkeypatch):
@@ -227,7 +223,7 @@ def test_a_shard_that_fails_does_not_stop_the_others(whole, tmp_path, monkeypatc
     assert bits(tmp_path / "run") == bits(whole)
 
 
-def test_weights_snapshots_are_policies_and_the_shard_starts_again(whole, tmp_path):
+def test_checkpoints_of_weights_are_policies_and_the_shard_starts_again(whole, tmp_path):
     light = RunOptions(checkpoint="weights", checkpoint_every_s=0.0, checkpoint_share=1.0)
     run_study(STUDY, tmp_path / "run", command="x", shard_size=2, options=light, on_progress=stop_after(10))
     older, newest = sorted((tmp_path / "run" / "shards" / "00000").glob("checkpoint-*.npz"))
@@ -241,7 +237,7 @@ def test_weights_snapshots_are_policies_and_the_shard_starts_again(whole, tmp_pa
 
 
 @pytest.mark.parametrize("name", ["a b", "täst-ünï-日本", "deep/er/../run", "link"])
-def test_any_path_will_do(whole, tmp_path, name):
+def test_a_run_can_have_any_path(whole, tmp_path, name):
     (tmp_path / "deep" / "er").mkdir(parents=True)
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "elsewhere")
@@ -251,8 +247,8 @@ def test_any_path_will_do(whole, tmp_path, name):
 
 
 def test_the_log_says_what_happened(stopped):
-    assert [told["shard"] for told in events(stopped, "claimed")] == [0, 1, 1]
-    assert [told["taken_over"] for told in events(stopped, "claimed")] == [False, False, True]
+    assert [event["shard"] for event in events(stopped, "claimed")] == [0, 1, 1]
+    assert [event["taken_over"] for event in events(stopped, "claimed")] == [False, False, True]
     assert events(stopped, "chunk")[0].keys() == {
         "event", "at", "shard", "steps", "episode_length", "steps_per_second"
     }  # fmt: skip
@@ -270,6 +266,6 @@ def test_results_as_tables(whole):
     assert jax.device_count() == 2
 
 
-def test_final_files_are_those_that_are_compared(whole):
-    assert {file.name for file in whole.iterdir()} == {*FINAL, "run.json", "plan.json", "log"}
+def test_all_files_of_a_run_but_its_labels_and_log_are_compared(whole):
+    assert {file.name for file in whole.iterdir()} == {*FINAL, "run.json", "run_plan.json", "log"}
     assert RunFolder.open(whole).complete

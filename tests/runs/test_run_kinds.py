@@ -1,10 +1,11 @@
-"""Runs with reward functions, with agents that diverge, with TensorBoard."""
+"""Runs with reward functions, with diverging agents, with TensorBoard."""
 
 import pytest
 
 from tests.runs.processes import TINY, events, stop_after
+from tests.runs.test_log import read_scalars
 from uavmec_jax.errors import StudyError
-from uavmec_jax.runs.folder import RunOptions
+from uavmec_jax.runs.options import RunOptions
 from uavmec_jax.runs.run import resume_run, run_study
 from uavmec_jax.runs.shared_run import work_on
 from uavmec_jax.studies.study import parse_study
@@ -14,7 +15,7 @@ pytestmark = pytest.mark.slow
 STUDY = parse_study(TINY, "tiny")
 
 
-def test_a_reward_function_is_given_again(tmp_path):
+def test_resuming_needs_the_reward_function_again(tmp_path):
     def survival(terms):
         return terms["U"]
 
@@ -29,24 +30,16 @@ def test_a_reward_function_is_given_again(tmp_path):
     assert again.run["reward_function"].endswith("survival")
 
 
-def test_agents_that_diverge_leave_the_others_alone(tmp_path):
-    """Learning rates of 1e30, beside one that is sound (NaN and infinity: `tests/learning/test_dqn.py`)."""
+def test_agents_that_diverge_do_not_affect_the_others():
+    """Train with a learning rate of 1e30 beside a sensible one (NaN and infinity: `tests/agents/test_dqn.py`)."""
     rates = {"axes.learning_rate": [7e-4, 1e30], "axes.powered": [8], "algorithm": "dqn", "steps": 1000}
     both = run_study(parse_study(TINY, "tiny", rates)).agents
     assert (both["diverged_at"] >= 0).tolist() == [False, True, False, True]
 
 
-def test_curves_go_to_tensorboard_too(tmp_path):
-    from tensorboardX.proto.event_pb2 import Event
-
+def test_curves_are_also_written_for_tensorboard(tmp_path):
     run_study(STUDY, tmp_path / "run", options=RunOptions(tensorboard=True))
-    (file,) = (tmp_path / "run" / "tensorboard" / "shard-00000").iterdir()
-    data, values = file.read_bytes(), {}
-    while data:
-        length = int.from_bytes(data[:8], "little")
-        for value in Event.FromString(data[12 : 12 + length]).summary.value:
-            values.setdefault(value.tag, []).append(value.simple_value)
-        data = data[16 + length :]
+    values = read_scalars(tmp_path / "run" / "tensorboard" / "shard-00000")
     chunks = events(tmp_path / "run", "chunk")
     assert values["episode_length"] == pytest.approx([chunk["episode_length"] for chunk in chunks])
     assert len(values["validation"]) == 8

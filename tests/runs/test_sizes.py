@@ -1,24 +1,26 @@
-"""Runs of many agents: planned and looked at quickly, or refused."""
+"""Runs of many agents: planning and status are quick; too many agents are refused."""
 
 import pytest
 
 from tests.runs.processes import TINY
 from uavmec_jax.errors import StudyError
+from uavmec_jax.runs import shard_runner
 from uavmec_jax.runs.checkpoints import interval_s
 from uavmec_jax.runs.run import run_study
 from uavmec_jax.runs.run_plan import plan_run
 from uavmec_jax.runs.shared_run import prepare_run
 from uavmec_jax.runs.simulate import simulate
 from uavmec_jax.runs.status import run_status
-from uavmec_jax.studies import study as studies
+from uavmec_jax.studies import population
 from uavmec_jax.studies.study import load_study, parse_study
 
 
-def test_a_hundred_thousand_agents_are_planned_and_looked_at_without_making_one(tmp_path, monkeypatch):
-    def nobody(study):
+def test_a_hundred_thousand_agents_are_planned_without_making_one(tmp_path, monkeypatch):
+    def refuse(study):
         raise AssertionError("the agents were enumerated")
 
-    monkeypatch.setattr(studies, "make_agent_ids", nobody)
+    for module in (population, shard_runner):
+        monkeypatch.setattr(module, "make_agent_ids", refuse)
     study = parse_study(TINY, "tiny", {"axes.seeds": 50_000})
     prepare_run(study, tmp_path / "run")
     status = run_status(tmp_path / "run")
@@ -28,10 +30,10 @@ def test_a_hundred_thousand_agents_are_planned_and_looked_at_without_making_one(
     assert [path.name for path in (tmp_path / "run" / "shards").iterdir()] == ["lease-0001.json"]
 
 
-def test_large_snapshots_come_less_often():
+def test_large_checkpoints_are_written_less_often():
     assert interval_s(60.0, 0.02, size=1e6) == 60.0
     assert interval_s(60.0, 0.02, size=1e6, cost_s=3.0) == pytest.approx(150.0)
-    assert interval_s(0.0, 0.1, size=1.5e9) == pytest.approx(100.0)  # at 150 MB/s, before one was written
+    assert interval_s(0.0, 0.1, size=1.5e9) == pytest.approx(100.0)  # at 150 MB/s, before the first is timed
 
 
 def test_a_population_beyond_all_memory_is_refused_with_an_estimate(tmp_path):
@@ -45,7 +47,7 @@ def test_a_population_beyond_all_memory_is_refused_with_an_estimate(tmp_path):
 def test_a_simulation_adds_up():
     study = load_study("table5", {"axes.seeds": 8})  # 200 agents
     plan = plan_run(study, shard_size=40)
-    groups = plan.blocks["dqn"].groups
+    groups = plan.partitions["dqn"].groups
     one, two = (simulate(study, plan, speed=100_000, devices=n * groups) for n in (1, 2))
     assert one.training_s == pytest.approx(200 * 1_000_000 / (100_000 * groups), rel=0.01)
     assert two.training_s == pytest.approx(one.training_s * 3 / 5, rel=0.01)  # five shards, two at a time
@@ -53,6 +55,6 @@ def test_a_simulation_adds_up():
     fast = simulate(study, plan, speed={"dqn": 200_000}, devices=groups)
     assert fast.training_s == pytest.approx(one.training_s / 2)
     assert fast.other_s == one.other_s
-    assert one.memory_bytes > plan.blocks["dqn"].bytes
+    assert one.memory_bytes > plan.partitions["dqn"].shard_bytes
     assert "wall time" in str(one)
     assert one.as_json()["wall_s"] == one.training_s + one.other_s

@@ -1,4 +1,4 @@
-"""Signals end a run between two chunks, or at once where it says so."""
+"""Signals end a run between two chunks, or at once where it can be interrupted."""
 
 import os
 import signal
@@ -9,7 +9,7 @@ from uavmec_jax.runs.signals import Interrupted, StopSignal
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_is_noted_and_the_second_one_interrupts(number):
+def test_a_signal_is_recorded_and_the_second_one_interrupts(number):
     before = signal.getsignal(number)
     with StopSignal() as stop:
         stop.check()
@@ -22,14 +22,14 @@ def test_a_signal_is_noted_and_the_second_one_interrupts(number):
     assert signal.getsignal(number) == before
 
 
-def test_at_once_means_at_once():
-    def work(stop, before):
-        if before:
+def test_a_signal_interrupts_an_interruptible_section():
+    def work(stop, early):
+        if early:
             os.kill(os.getpid(), signal.SIGTERM)
         with stop.interruptible():
             os.kill(os.getpid(), signal.SIGTERM)
             raise AssertionError("too late")
 
-    for before in (False, True):
+    for early in (False, True):
         with StopSignal() as stop, pytest.raises(Interrupted):
-            work(stop, before)
+            work(stop, early)

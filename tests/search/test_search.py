@@ -1,4 +1,4 @@
-"""Hyperparameter search: spaces, batches with halving, and searches that are stopped."""
+"""Hyperparameter search: spaces, successive halving, and searches that are stopped."""
 
 import json
 
@@ -10,10 +10,11 @@ from uavmec_jax.errors import StudyError
 from uavmec_jax.reporting.search import history_figure, importance_figure, search_json, search_tables
 from uavmec_jax.search.confirm import confirm
 from uavmec_jax.search.halving import SuccessiveHalving
-from uavmec_jax.search.search import search
-from uavmec_jax.search.space import load_space, settings_of
+from uavmec_jax.search.search import run_search
+from uavmec_jax.search.space import load_space, study_changes
 from uavmec_jax.studies.compare import overall, pair
 from uavmec_jax.studies.study import load_study
+from uavmec_jax.training.training import Trainer
 
 SPACE = """
 study = "tiny.toml"
@@ -44,16 +45,17 @@ def space(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_search_that_is_stopped_ends_as_one_that_is_not(space, tmp_path):
-    whole = search(space, tmp_path / "whole", command="x")
+def test_a_stopped_search_continues_to_the_same_result(space, tmp_path):
+    whole = run_search(space, tmp_path / "whole", command="x")
 
-    def stop(news):
-        if news.trials == 4 and news.share > 0.5:
+    def stop(progress):
+        assert progress.batch_trials in (2, 4)
+        if progress.trials == 4 and progress.batch_share > 0.5:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        search(space, tmp_path / "stopped", command="x", on_progress=stop)
-    again = search(space, tmp_path / "stopped", command="x")
+        run_search(space, tmp_path / "stopped", command="x", on_progress=stop)
+    again = run_search(space, tmp_path / "stopped", command="x")
     for name in ("trials.csv", "best.toml"):
         assert (tmp_path / "stopped" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     assert again.best == whole.best
@@ -64,48 +66,55 @@ def test_a_search_that_is_stopped_ends_as_one_that_is_not(space, tmp_path):
     best = load_study(tmp_path / "whole" / "best.toml")
     assert best.a2c.learning_rate == whole.best["learning_rate"]
     assert best.reward == {"U": 1.0, "M": whole.best["reward.M"]}
-    assert best.axes["seeds"] == 2  # those that are reported, not those of the search
+    assert best.axes["seeds"] == 2  # the reported seeds, not those of the validation scenarios
 
-    more = search(space.model_copy(update={"trials": 9}), tmp_path / "whole", command="x")
+    more = run_search(space.model_copy(update={"trials": 9}), tmp_path / "whole", command="x")
     assert more.trials[:8].equals(trials)
     assert len(search_tables(more)) in (1, 2)
     for figure in (history_figure(more), importance_figure(more)):
         assert figure.axes
     assert json.dumps(search_json(more))
     with pytest.raises(StudyError, match="holds another search"):
-        search(space.model_copy(update={"batch": 3}), tmp_path / "whole")
+        run_search(space.model_copy(update={"batch": 3}), tmp_path / "whole")
 
-    # on towns that the search has not seen
-    own, best = confirm(more, tmp_path / "whole", command="x")
-    assert own.results.agents["seed"].unique().tolist() == [0, 1]
-    lives = [side.results.agents["best_lifetime"].to_numpy() for side in (own, best)]
-    assert overall(*pair(own, best))["difference"][0] == pytest.approx((lives[1] - lives[0]).mean())
+    # on scenarios that the search has not seen
+    baseline, best = confirm(more, tmp_path / "whole", command="x")
+    assert baseline.results.agents["seed"].unique().tolist() == [0, 1]
+    gains = best.results.agents["best_lifetime"] - baseline.results.agents["best_lifetime"]
+    assert overall(*pair(baseline, best))["difference"][0] == pytest.approx(gains.mean())
     again, _ = confirm(more, tmp_path / "whole")
-    assert again.results.agents.shape == own.results.agents.shape
+    assert again.results.agents.shape == baseline.results.agents.shape
 
     (tmp_path / "whole" / "trials.db").write_bytes(b"SQLite no more" * 1000)
     with pytest.raises(StudyError, match=r"trials.db: cannot be read: file is not a database"):
-        search(space, tmp_path / "whole")
+        run_search(space, tmp_path / "whole")
 
 
 @pytest.mark.slow
-def test_those_that_go_on_are_not_changed_by_those_that_are_given_up(space):
+def test_pruned_trials_do_not_affect_the_others_and_nothing_is_compiled_twice(space, monkeypatch):
+    compiled, compile_trainer = [], Trainer.compile
+    monkeypatch.setattr(
+        Trainer, "compile", lambda *arguments: compiled.append(arguments) or compile_trainer(*arguments)
+    )
     trials = [{"learning_rate": rate, "reward.M": 0.0} for rate in (1e-4, 3e-4, 1e-3, 1e30)]
-    halved = SuccessiveHalving(space).run(trials)
-    whole = SuccessiveHalving(space.model_copy(update={"halving": type(space.halving)()})).run(trials)
-    assert [outcome.value is None for outcome in halved].count(True) == 2
-    assert halved[3].value is None
-    for one, other in zip(halved, whole, strict=True):
-        assert one.value in (None, other.value)
-    assert len(halved[0].rungs) in (1, 2)
-    assert np.isfinite([outcome.value for outcome in whole]).all()
+    halving = SuccessiveHalving(space)
+    pruned = halving.run(trials)
+    assert halving.run(trials) == pruned
+    assert len(compiled) == 1  # for both rungs of both batches
+    complete = SuccessiveHalving(space.model_copy(update={"halving": type(space.halving)()})).run(trials)
+    assert [outcome.value is None for outcome in pruned].count(True) == 2
+    assert pruned[3].value is None
+    for outcome, reference in zip(pruned, complete, strict=True):
+        assert outcome.value in (None, reference.value)
+    assert len(pruned[0].rungs) in (1, 2)
+    assert np.isfinite([outcome.value for outcome in complete]).all()
 
 
 def test_the_shipped_space():
     space = load_space("dqn")
     assert space.base().name == "table5"
-    assert SuccessiveHalving(space).towns == 20
-    changes = settings_of(space, {"learning_rate": 0.001, "reward.U": 0.5})
+    assert SuccessiveHalving(space).n_scenarios == 20
+    changes = study_changes(space, {"learning_rate": 0.001, "reward.U": 0.5})
     assert changes["dqn.learning_rate"] == 0.001
     assert changes["reward"] == {"U": 0.5, "log A": 1.0, "log O": -1.0}
 
@@ -129,7 +138,11 @@ def test_the_shipped_space():
         ("low = 1e-4", "low = -1.0", "space.learning_rate has low -1.0 and log = true"),
         ("[[8], [16, 16]]", "[[8], [0]]", "space.hidden has [0]; it should be greater than or equal to 1"),
         ("[[8], [16, 16]]", "[[8]]", "space.hidden"),
-        ("seeds = 2\ncells", "first_seed = 1\nseeds = 2\ncells", "validation.first_seed is 1: town 1 is one that"),
+        (
+            "seeds = 2\ncells",
+            "first_seed = 1\nseeds = 2\ncells",
+            "validation.first_seed is 1: the study reports the scenarios of seed 1",
+        ),
         ("[[12, 8]]", "[[13, 8]]", "validation.cells has [13, 8]; give counts from 0 to 12"),
         ("rungs = [0.3]", "rungs = [1.5]", "halving.rungs.0 is 1.5; it should be less than 1"),
         ('"tiny.toml"', '"table6"', "study 'table6' trains 3 algorithms; search one"),
@@ -151,8 +164,8 @@ def test_folders_that_cannot_take_a_search(space, tmp_path):
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "a.txt").write_text("mine")
     with pytest.raises(StudyError, match="is not empty and holds no search"):
-        search(space, tmp_path / "notes")
+        run_search(space, tmp_path / "notes")
     with pytest.raises(StudyError, match="exists and is not a folder"):
-        search(space, tmp_path / "tiny.toml")
+        run_search(space, tmp_path / "tiny.toml")
     with pytest.raises(StudyError, match=r"nowhere: neither a file of a search space nor a shipped one; known: dqn"):
         load_space("nowhere")

@@ -1,17 +1,20 @@
-"""What every learning algorithm is: a pair of pure functions over one agent, and a policy made from its weights."""
+"""The interface of the learning algorithms: a pair of pure functions over one agent, and a policy from its weights."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from flax import struct
-from jaxtyping import Array
+from jaxtyping import Array, Int, Key
 
-from uavmec_jax.agents.observation_spec import OBSERVATIONS
+from uavmec_jax.agents.networks import Weights
 from uavmec_jax.env.dynamics import State
+from uavmec_jax.env.generator import ScenarioDistribution
 from uavmec_jax.env.layout import Layout
+from uavmec_jax.env.observation import observe
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Policy
+from uavmec_jax.env.scenario import Scenario
 
 AGENTS_AXIS = "agents"
 """Name of the ``vmap`` axis of the population; ``update`` runs under it."""
@@ -19,26 +22,34 @@ AGENTS_AXIS = "agents"
 
 @struct.dataclass
 class Agent:
-    """One learning problem: constant while training. Batched by ``vmap``.
+    """A learning problem: everything about an agent that does not change during training. ``vmap`` batches it.
 
     Attributes:
-        key: the agent's own randomness, from its identity, never from its place in a batch.
-        scenario: what it plays: one scenario, or (PPO and A2C) a distribution, from which every episode draws its own.
-        hyper: how it learns; the algorithm's pytree of traced hyperparameters.
+        key: the agent's own randomness, derived from its identity, never from its place in a batch.
+        scenario: the scenario of all its episodes, or (PPO and A2C) a distribution from which every episode draws its own.
+        hyper: the traced hyperparameters, a pytree that the algorithm declares.
     """
 
-    key: Any
-    scenario: Any
+    key: Key[Array, "*batch"]
+    scenario: Scenario | ScenarioDistribution
     hyper: Any
 
 
-class LearnerState(Protocol):
-    """The part of an algorithm's state that the population looks at (leaves ``[B, ...]``)."""
+@runtime_checkable
+class AlgorithmState(Protocol):
+    """The part of an algorithm's state that the population reads. Every algorithm's state has it.
 
-    weights: Any
-    diverged_at: Any
-    episode_slots: Any
-    episodes: Any
+    Attributes:
+        weights: what the greedy policy is made from.
+        diverged_at: environment step at which the agent was frozen, -1 if it has not diverged.
+        episode_slots: total length of the training episodes that ended in the last call of ``update``, slots.
+        episodes: number of these episodes.
+    """
+
+    weights: Weights
+    diverged_at: Int[Array, "*batch"]
+    episode_slots: Int[Array, "*batch"]
+    episodes: Int[Array, "*batch"]
 
 
 @dataclass(frozen=True)
@@ -51,12 +62,13 @@ class Algorithm:
         steps_per_iteration: environment steps of one agent in one iteration.
         agent_bytes: memory of one agent in training.
         init: ``(agent) -> state``.
-        update: ``(agent, state, first, last) -> state``: the iterations ``first <= i < last``; the two bounds are
-            shared by all agents and never batched. Runs under ``vmap(axis_name=AGENTS_AXIS)``.
-        greedy: ``(hyper, weights, observation [..., obs_size]) -> action [...]`` int32, the best one in the eyes of the weights.
+        update: ``(agent, state, first, last) -> state``: runs the iterations ``first <= i < last``. The two bounds are
+            shared by all agents and never batched. Must run under ``vmap(axis_name=AGENTS_AXIS)``.
+        greedy: ``(hyper, weights, observation [..., obs_size]) -> action [...]``, int32: the action that the policy
+            network finds likeliest, or that has the highest Q-value.
         observation_fn: ``(params, layout, state) -> observation [..., obs_size]``; by default the paper's.
-        value_fn: ``(hyper, weights, observation [B, obs_size]) -> [B]``, what the rest of an episode is worth; ``None`` where
-            there is no value_fn.
+        value_fn: ``(hyper, weights, observation [B, obs_size]) -> value [B]``, the expected return from a state;
+            ``None`` if the algorithm learns no state values.
     """
 
     name: str
@@ -65,14 +77,14 @@ class Algorithm:
     agent_bytes: int
     init: Callable[[Agent], Any]
     update: Callable[[Agent, Any, Any, Any], Any]
-    greedy: Callable[[Any, Any, Array], Array]
-    observation_fn: Callable[[Params, Layout, State], Array] = OBSERVATIONS["paper"].observation_fn
-    value_fn: Callable[[Any, Any, Array], Array] | None = None
+    greedy: Callable[[Any, Weights, Array], Array]
+    observation_fn: Callable[[Params, Layout, State], Array] = observe
+    value_fn: Callable[[Any, Weights, Array], Array] | None = None
 
-    def policy(self, hyper: Any, weights: Any) -> Policy:
-        """The greedy policy of an agent; ties go to the lowest number. States may be batched."""
+    def policy(self, hyper: Any, weights: Weights) -> Policy:
+        """Return the greedy policy of an agent. Ties go to the lowest device number; states may be batched."""
 
-        def act(params: Params, layout: Layout, state: State, key: Any = None) -> Array:
+        def act(params: Params, layout: Layout, state: State, key: Any = None) -> Int[Array, "*batch"]:
             return self.greedy(hyper, weights, self.observation_fn(params, layout, state))
 
         return act

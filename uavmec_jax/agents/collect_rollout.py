@@ -1,4 +1,4 @@
-"""What an actor and a critic learn from: slots played in a few environments, with generalized_advantages and returns."""
+"""The samples that PPO and A2C learn from: slots played in an agent's environments, with advantages and returns."""
 
 from dataclasses import replace
 from functools import partial
@@ -6,121 +6,139 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from uavmec_jax.agents import on_policy
+from uavmec_jax.agents import actor_critic
+from uavmec_jax.agents.actor_critic import ActorCriticSpec, ActorCriticState
 from uavmec_jax.agents.algorithm import AGENTS_AXIS, Agent
-from uavmec_jax.agents.gae import generalized_advantages, log_probability, sample_action
-from uavmec_jax.agents.on_policy import OnPolicySpec, OnPolicyState
+from uavmec_jax.agents.gae import generalized_advantages, log_prob_and_entropy, sample_action
 from uavmec_jax.env.dynamics import Cause, State, initial_state
 from uavmec_jax.env.generator import sample_scenario
 from uavmec_jax.env.scenario import Scenario, advance, auto_reset, draw_volumes, is_truncated
 
 
 class Samples(NamedTuple):
-    """What a gradient is taken on, leading axis ``B``.
+    """A batch of samples for a gradient step.
 
-    ``observation`` f32 ``[B, obs_size]``, ``action`` int32 ``[B]``, ``advantage``, ``returns`` f32 ``[B]``, and ``log_prob``
-    f32 ``[B]``, the log-probability of the action when it was taken.
+    Attributes:
+        observation: what the policy saw.
+        action: what it did.
+        advantage: generalised advantage estimate of the action.
+        returns: estimate of the return, the target of the value network.
+        log_prob: log-probability of the action when it was sampled.
     """
 
-    observation: Array
-    action: Array
-    advantage: Array
-    returns: Array
-    log_prob: Array
+    observation: Float[Array, "*batch B obs_size"]
+    action: Int[Array, "*batch B"]
+    advantage: Float[Array, "*batch B"]
+    returns: Float[Array, "*batch B"]
+    log_prob: Float[Array, "*batch B"]
+
+
+class _Slot(NamedTuple):
+    """One slot in every environment: observation before it, action, reward, and whether an episode ended."""
+
+    observation: Float[Array, "*t e obs_size"]
+    action: Int[Array, "*t e"]
+    reward: Float[Array, "*t e"]
+    ended: Bool[Array, "*t e"]
 
 
 def collect_rollout(
-    spec: OnPolicySpec, agent: Agent, state: OnPolicyState, key: PRNGKeyArray
-) -> tuple[OnPolicyState, Samples]:
-    """Play ``n_steps`` slots in every environment; returns ``n_steps * n_envs`` samples, environments innermost.
+    spec: ActorCriticSpec, agent: Agent, state: ActorCriticState, key: PRNGKeyArray
+) -> tuple[ActorCriticState, Samples]:
+    """Play ``n_steps`` slots in every environment and return ``n_steps * n_envs`` samples, environments innermost.
 
-    All randomness of the slots is one draw: per slot and environment a volume for each device, and one number for the
-    action. Where the agent plays a distribution, every episode that ends is followed by one in a fresh scenario.
+    All randomness of the slots comes from a single draw: for each slot and environment one number for the task volume of
+    each device and one for the action. If the agent has a distribution, each new episode is in a newly drawn scenario.
     """
     n, hyper, weights = spec.n_devices, agent.hyper, state.weights
     bits = jax.random.bits(key, (spec.n_steps, spec.n_envs, n + 1))
 
-    def slot(state: OnPolicyState, numbered: tuple[Any, Any]) -> tuple[OnPolicyState, tuple]:
+    def play_slot(state: ActorCriticState, numbered: tuple[Array, Array]) -> tuple[ActorCriticState, _Slot]:
         number, bits = numbered
         uniform = (bits >> 8).astype(jnp.float32) * 2.0**-24
-        return _slot(spec, agent, state, uniform, jax.random.fold_in(key, number))
+        return _play_slot(spec, agent, state, uniform, jax.random.fold_in(key, number))
 
-    state, (observation, action, reward, ended) = jax.lax.scan(slot, state, (jnp.arange(spec.n_steps), bits))
-    flat = observation.reshape(-1, spec.obs_size)
-    scores, values = on_policy.both(spec, hyper, weights, flat)
-    values = values.reshape(reward.shape)
-    ahead = on_policy.value(spec, hyper, weights, _see(spec, *_played(agent, state), state.env_states))
-    advantage = generalized_advantages(reward, values, ahead, ended, hyper.gamma, hyper.gae_lambda)
-    taken = action.reshape(-1)
+    state, slots = jax.lax.scan(play_slot, state, (jnp.arange(spec.n_steps), bits))
+    observation, action = slots.observation.reshape(-1, spec.obs_size), slots.action.reshape(-1)
+    logits, values = actor_critic.logits_and_value(spec, hyper, weights, observation)
+    values = values.reshape(slots.reward.shape)
+    last_observation = _observe(spec, *_scenarios_and_axis(agent, state), state.env_states)
+    last_value = actor_critic.value(spec, hyper, weights, last_observation)
+    advantage = generalized_advantages(slots.reward, values, last_value, slots.ended, hyper.gamma, hyper.gae_lambda)
     return state, Samples(
-        observation=flat,
-        action=taken,
+        observation=observation,
+        action=action,
         advantage=advantage.reshape(-1),
         returns=(advantage + values).reshape(-1),
-        log_prob=log_probability(scores, taken)[0],
+        log_prob=log_prob_and_entropy(logits, action)[0],
     )
 
 
-def _played(agent: Agent, state: OnPolicyState) -> tuple[Scenario, int | None]:
-    """What the environments collect_rollout, and its axis: one for each of them, or one for all."""
+def _scenarios_and_axis(agent: Agent, state: ActorCriticState) -> tuple[Any, int | None]:
+    """Return the environments' scenarios and their ``vmap`` axis: one scenario each, or one for all (``None``)."""
     return (agent.scenario, None) if state.scenarios is None else (state.scenarios, 0)
 
 
-def _see(spec: OnPolicySpec, scenario: Scenario, axis: int | None, env_states: State) -> Float[Array, "e obs_size"]:
-    """What is seen of every environment."""
-    see = lambda scenario, env_state: spec.observation_spec.observation_fn(scenario.params, scenario.layout, env_state)  # noqa: E731
-    return jax.vmap(see, (axis, 0))(scenario, env_states)
+def _observe(
+    spec: ActorCriticSpec, scenarios: Scenario, axis: int | None, env_states: State
+) -> Float[Array, "e obs_size"]:
+    """Return the observation of every environment."""
+    observation_fn = spec.observation_spec.observation_fn
+    observe = lambda scenario, env_state: observation_fn(scenario.params, scenario.layout, env_state)  # noqa: E731
+    return jax.vmap(observe, (axis, 0))(scenarios, env_states)
 
 
-def _slot(
-    spec: OnPolicySpec,
+def _play_slot(
+    spec: ActorCriticSpec,
     agent: Agent,
-    state: OnPolicyState,
+    state: ActorCriticState,
     uniform: Float[Array, "e n_plus_1"],
     key: PRNGKeyArray,
-) -> tuple[OnPolicyState, tuple[Array, Array, Array, Array]]:
-    """One slot in every environment: observations before it, actions, rewards, whether an episode ended.
+) -> tuple[ActorCriticState, _Slot]:
+    """Play one slot in every environment.
 
-    Where the time limit alone ended an episode, the reward holds the discounted value of what was cut off.
+    Where the time limit alone ended an episode, the discounted value of the state it was cut off in is added to the reward.
     """
     n = spec.n_devices
-    scenario, axis = _played(agent, state)
-    over_envs = lambda function, *arguments: jax.vmap(function, (axis, *(0 for _ in arguments)))(scenario, *arguments)  # noqa: E731
-    observation = _see(spec, scenario, axis, state.env_states)
-    action = sample_action(on_policy.logits(spec, agent.hyper, state.weights, observation), uniform[:, n])
+    scenarios, axis = _scenarios_and_axis(agent, state)
+    over_envs = lambda function, *arguments: jax.vmap(function, (axis, *(0 for _ in arguments)))(scenarios, *arguments)  # noqa: E731
+    observation = _observe(spec, scenarios, axis, state.env_states)
+    action = sample_action(actor_critic.logits(spec, agent.hyper, state.weights, observation), uniform[:, n])
     volumes = over_envs(lambda scenario, drawn: draw_volumes(scenario.params, drawn), uniform[:, :n])
     after, reward, outcome = over_envs(advance, state.env_states, action, volumes)
     truncated = over_envs(is_truncated, after, outcome)
     ended = (outcome.cause != Cause.NONE) | truncated
 
-    def with_cut_off() -> Array:
-        worth = on_policy.value(spec, agent.hyper, state.weights, _see(spec, scenario, axis, after))
-        return reward + jnp.where(truncated, agent.hyper.gamma * worth, 0.0)
+    def bootstrapped_reward() -> Float[Array, " e"]:
+        next_value = actor_critic.value(spec, agent.hyper, state.weights, _observe(spec, scenarios, axis, after))
+        return reward + jnp.where(truncated, agent.hyper.gamma * next_value, 0.0)
 
-    cut = jax.lax.pmax(jnp.any(truncated), AGENTS_AXIS)  # a true branch: the predicate is the same for all agents
-    reward = jax.lax.cond(cut, with_cut_off, lambda: reward)
+    # a real branch: the predicate is the same for all agents
+    any_truncated = jax.lax.pmax(jnp.any(truncated), AGENTS_AXIS)
+    reward = jax.lax.cond(any_truncated, bootstrapped_reward, lambda: reward)
     state = replace(
-        _restarted(agent, state, ended, after, key),
+        _reset_ended(agent, state, ended, after, key),
         episode_slots=state.episode_slots + jnp.sum(jnp.where(ended, after.slot, 0)),
         episodes=state.episodes + jnp.sum(ended),
     )
-    return state, (observation, action, reward, ended)
+    return state, _Slot(observation, action, reward, ended)
 
 
-def _restarted(
-    agent: Agent, state: OnPolicyState, ended: Bool[Array, " e"], after: State, key: PRNGKeyArray
-) -> OnPolicyState:
-    """The environments after a slot: new episodes where one has ended, in fresh scenarios if the agent plays many."""
-    if state.scenarios is None:
-        restart = lambda end, env_state: auto_reset(end, agent.scenario, env_state)  # noqa: E731
-        return replace(state, env_states=jax.vmap(restart)(ended, after))
-    fresh = jax.vmap(partial(sample_scenario, agent.scenario))(jax.random.split(key, ended.shape[0]))
-    begun = jax.vmap(initial_state)(fresh.params, fresh.layout)
+def _reset_ended(
+    agent: Agent, state: ActorCriticState, ended: Bool[Array, " e"], after: State, key: PRNGKeyArray
+) -> ActorCriticState:
+    """Start new episodes where one has ended, in newly drawn scenarios if the agent has a distribution."""
+    scenario = agent.scenario
+    if isinstance(scenario, Scenario):
+        env_states = jax.vmap(auto_reset, (0, None, 0))(ended, scenario, after)
+        return replace(state, env_states=env_states)
+    new_scenarios = jax.vmap(partial(sample_scenario, scenario))(jax.random.split(key, ended.shape[0]))
+    new_states = jax.vmap(initial_state)(new_scenarios.params, new_scenarios.layout)
 
-    def choose_leaf(new: Array, old: Array) -> Array:
+    def select(new: Array, old: Array) -> Array:
         return jnp.where(ended.reshape(-1, *(1 for _ in new.shape[1:])), new, old)
 
-    scenarios, env_states = jax.tree.map(choose_leaf, (fresh, begun), (state.scenarios, after))
+    scenarios, env_states = jax.tree.map(select, (new_scenarios, new_states), (state.scenarios, after))
     return replace(state, scenarios=scenarios, env_states=env_states)

@@ -1,4 +1,4 @@
-"""Networks of the learners: small dense stacks, initialised as Stable-Baselines3 initialises its own."""
+"""Networks: small dense stacks, initialised as Stable-Baselines3 does."""
 
 import math
 from typing import Any
@@ -6,17 +6,21 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from uavmec_jax.env.fixed_point import order_independent_sum
+from uavmec_jax.env.types import Scalar
+
+Weights = Any
+"""Parameters of a network, or their gradient: nested dictionaries of arrays, leaves ``[*batch, ...]``."""
 
 
 @jax.custom_vjp
 def matmul(x: Float[Array, "... i"], w: Float[Array, "i o"]) -> Float[Array, "... o"]:
-    """``x @ w`` whose backward pass transposes its operands in memory first.
+    """Return ``x @ w``. The backward pass transposes its operands in memory first.
 
-    XLA's CPU products run two to three times slower on the layout that plain autodiff hands them; the barrier makes
-    the transposed copy real. The numbers are those of ``x @ w``.
+    On a CPU, XLA's matrix products are two to three times slower on the memory layout that plain autodiff produces. The
+    barrier keeps XLA from optimising the transposed copies away. The result is that of ``x @ w``, to the bit.
     """
     return x @ w
 
@@ -35,7 +39,7 @@ matmul.defvjp(_matmul_forward, _matmul_backward)
 
 
 class TorchDense(nn.Module):
-    """Dense layer, weights and biases uniform in ``+-1/sqrt(fan_in)`` (PyTorch's default for ``Linear``)."""
+    """Dense layer with weights and biases uniform in ``+-1/sqrt(fan_in)``, PyTorch's default for ``Linear``."""
 
     features: int
 
@@ -44,7 +48,7 @@ class TorchDense(nn.Module):
         """Apply the layer to ``[i]`` or ``[batch, i]``."""
         fan_in = x.shape[-1]
 
-        def uniform(key: Array, shape: tuple[int, ...]) -> Array:
+        def uniform(key: PRNGKeyArray, shape: tuple[int, ...]) -> Array:
             bound = fan_in**-0.5
             return jax.random.uniform(key, shape, jnp.float32, -bound, bound)
 
@@ -53,16 +57,16 @@ class TorchDense(nn.Module):
         return (matmul(x, kernel) if x.ndim > 1 else x @ kernel) + bias
 
 
-def orthogonal(key: Array, shape: tuple[int, int], gain: float) -> Float[Array, "i o"]:
-    """A uniformly random matrix with orthonormal columns (rows, if there are fewer), times ``gain``.
+def orthogonal(key: PRNGKeyArray, shape: tuple[int, int], gain: float) -> Float[Array, "i o"]:
+    """Draw a uniformly random matrix with orthonormal columns (rows, if there are fewer), times ``gain``.
 
-    Gram-Schmidt on Gaussian columns, each made orthogonal twice to be so to rounding. (Not LAPACK's QR: several of
-    them at once on several CPU devices wait for each other for ever in jaxlib 0.10.)
+    It is made by Gram-Schmidt on Gaussian columns; each column is orthogonalised twice, which leaves only rounding
+    errors. LAPACK's QR is avoided: in jaxlib 0.10 it deadlocks when several CPU devices call it at the same time.
     """
     rows, columns = max(shape), min(shape)
     gaussian = jax.random.normal(key, (rows, columns))
 
-    def add_column(k: Any, basis: Array) -> Array:
+    def add_column(k: Int[Array, ""], basis: Float[Array, "r c"]) -> Float[Array, "r c"]:
         column = gaussian[:, k]
         for _ in range(2):
             column = column - basis @ (column @ basis)
@@ -91,7 +95,7 @@ class QNetwork(nn.Module):
     Attributes:
         n_actions: number of actions, one per device.
         hidden: widths of the hidden layers; (64, 64) in the paper.
-        dueling: whether the head is a state value and generalized_advantages of mean zero (Wang et al., 2016, equation 9).
+        dueling: whether the head is a state value plus advantages of mean zero (Wang et al., 2016, equation 9).
     """
 
     n_actions: int
@@ -100,7 +104,7 @@ class QNetwork(nn.Module):
 
     @nn.compact
     def __call__(self, observation: Float[Array, "... two_n"]) -> Float[Array, "... n"]:
-        """Q-values ``[..., n]`` of observations ``[..., 2n]``; at most one batch axis where gradients are taken."""
+        """Return Q-values ``[..., n]`` of observations ``[..., 2n]``. Gradients allow at most one batch axis."""
         x = observation
         for width in self.hidden:
             x = nn.relu(TorchDense(width)(x))
@@ -111,7 +115,7 @@ class QNetwork(nn.Module):
 
 
 class MLP(nn.Module):
-    """Tanh layers with orthogonal weights (gain sqrt 2), then a linear head."""
+    """Tanh layers with orthogonal weights (gain sqrt 2), then a linear layer whose gain is ``head_gain``."""
 
     features: int
     hidden: tuple[int, ...]
@@ -126,11 +130,11 @@ class MLP(nn.Module):
 
 
 class ActorCritic(nn.Module):
-    """Separate networks for policy and value, as Stable-Baselines3's PPO and A2C have them.
+    """Separate networks for policy and value, as in Stable-Baselines3's PPO and A2C.
 
     Attributes:
         n_actions: number of actions, one per device.
-        hidden: widths of the hidden layers of each.
+        hidden: widths of the hidden layers of each network.
     """
 
     n_actions: int
@@ -142,33 +146,33 @@ class ActorCritic(nn.Module):
         self.critic = MLP(1, self.hidden, head_gain=1.0)
 
     def logits(self, observation: Float[Array, "b two_n"]) -> Float[Array, "b n"]:
-        """Unnormalised log-probabilities ``[B, n]`` of the actions."""
+        """Return the unnormalised log-probabilities of the actions."""
         return self.policy(observation)
 
     def value(self, observation: Float[Array, "b two_n"]) -> Float[Array, " b"]:
-        """State values ``[B]``."""
+        """Return the state values."""
         return self.critic(observation)[:, 0]
 
-    def __call__(self, observation: Float[Array, "b two_n"]) -> tuple[Array, Array]:
-        """Logits and values."""
+    def __call__(self, observation: Float[Array, "b two_n"]) -> tuple[Float[Array, "b n"], Float[Array, " b"]]:
+        """Return logits and values."""
         return self.logits(observation), self.value(observation)
 
 
-def count_weights(network: nn.Module, observation_size: int) -> int:
-    """Number of weights of a network, without making them."""
-    made: Any = jax.eval_shape(network.init, jax.random.key(0), jnp.zeros((1, observation_size)))
-    return sum(leaf.size for leaf in jax.tree.leaves(made))
+def count_weights(network: nn.Module, obs_size: int) -> int:
+    """Count the weights of a network without allocating them."""
+    weights: Weights = jax.eval_shape(network.init, jax.random.key(0), jnp.zeros((1, obs_size)))
+    return sum(leaf.size for leaf in jax.tree.leaves(weights))
 
 
-def scale_ages(observation: Float[Array, "*b two_n"], age_scale: Any) -> Float[Array, "*b two_n"]:
-    """An observation with its ages, the second half, multiplied by ``age_scale``."""
+def scale_ages(observation: Float[Array, "*b two_n"], age_scale: Scalar) -> Float[Array, "*b two_n"]:
+    """Multiply the ages, the second half of the paper's observation, by ``age_scale``."""
     size = observation.shape[-1]
     return observation * jnp.where(jnp.arange(size) < size // 2, 1.0, age_scale)
 
 
 @jax.custom_jvp
 def sum_over_devices(x: Float[Array, "b n f"]) -> Float[Array, "b f"]:
-    """:func:`order_independent_sum` over the devices, with the gradient of a plain sum."""
+    """Sum over the devices with :func:`order_independent_sum`; the gradient is that of a plain sum."""
     return order_independent_sum(x, axis=-2)
 
 
@@ -178,10 +182,10 @@ def _sum_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Arra
 
 
 class RowScore(nn.Module):
-    """One number for each row, orthogonal weights times ``gain``, the bits of which do not depend on the row's place.
+    """Dense layer with one output and orthogonal weights times ``gain``; its bits do not depend on the row's place.
 
-    A matrix product with one column has other bits in the last rows of a batch than in the first (XLA's CPU kernels); a
-    product and a sum over each row by itself have not.
+    XLA's CPU kernels compute a matrix product with a single column differently in the last rows of a batch. A product and
+    a sum over each row give the same bits everywhere.
     """
 
     gain: float
@@ -194,15 +198,15 @@ class RowScore(nn.Module):
 
 
 class EquivariantActorCritic(nn.Module):
-    """An actor and a critic for any number of devices; permuting the devices permutes the logits to the bit.
+    """An actor and a critic for any number of devices; permuting the devices permutes the logits, to the bit.
 
-    An encoder looks at every device by itself; means and maxima over the devices tell the policy head, again for every
-    device by itself, about the others (Zaheer et al., 2017, Deep sets, theorem 2 and section 4). The names of the layers are
-    those of the published weights, and seed the initial ones.
+    An encoder embeds each device on its own. Means and maxima of the embeddings over the devices tell the policy head,
+    which scores each device, about the other devices (Zaheer et al., 2017, Deep sets, theorem 2 and section 4). The names
+    of the layers are those in the published weights; they also seed the initial weights.
 
     Attributes:
-        n_features: features of a device; the rows of an observation hold its mask behind them.
-        hidden: widths of the encoder's layers; the last one is that of the heads, too.
+        n_features: features of a device; each row of an observation is these features and the device's mask.
+        hidden: widths of the encoder's layers; the heads have the width of the last one.
     """
 
     n_features: int
@@ -212,45 +216,49 @@ class EquivariantActorCritic(nn.Module):
         """Declare the layers."""
         gain, width = math.sqrt(2.0), self.hidden[-1]
         self.encoder = [OrthogonalDense(size, gain, name=f"looks_{k}") for k, size in enumerate(self.hidden)]
-        self.policy_own = OrthogonalDense(width, gain, name="own")
+        self.policy_device = OrthogonalDense(width, gain, name="own")
         self.policy_pooled = OrthogonalDense(width, gain, name="others")
         self.policy_head = RowScore(0.01, name="score")
         self.value_hidden = OrthogonalDense(width, gain, name="appraise")
         self.value_head = RowScore(1.0, name="worth")
 
-    def _encode(self, observation: Float[Array, "B obs_size"]) -> tuple[Array, Array, Array]:
-        """Embed every device ``[B, n, h]``, pool them ``[B, 2h]``, and return the mask ``[B, n]``."""
+    def _encode(
+        self, observation: Float[Array, "B obs_size"]
+    ) -> tuple[Float[Array, "B n h"], Float[Array, "B two_h"], Bool[Array, "B n"]]:
+        """Return the embedding of each device, the embeddings' means and maxima, and which entries are devices."""
         devices = observation.reshape(observation.shape[0], -1, self.n_features + 1)
         mask = devices[..., -1] > 0.5
         x = devices[..., :-1].reshape(-1, self.n_features)
         for layer in self.encoder:
             x = nn.relu(layer(x))
         x = x.reshape(*mask.shape, -1)
-        present = jnp.where(mask[..., None], x, 0.0)  # relu leaves nothing below 0, so padding never is the maximum
+        present = jnp.where(mask[..., None], x, 0.0)  # relu is at least 0, so padding never is the maximum
         count = jnp.maximum(jnp.sum(mask, axis=-1, keepdims=True), 1)
         return x, jnp.concatenate([sum_over_devices(present) / count, jnp.max(present, axis=-2)], axis=-1), mask
 
-    def _logits(self, x: Array, pooled: Array, mask: Array) -> Float[Array, "B n"]:
-        own = self.policy_own(x.reshape(-1, x.shape[-1])).reshape(x.shape)
-        x = nn.relu(own + self.policy_pooled(pooled)[:, None])
+    def _logits(
+        self, x: Float[Array, "B n h"], pooled: Float[Array, "B two_h"], mask: Bool[Array, "B n"]
+    ) -> Float[Array, "B n"]:
+        device = self.policy_device(x.reshape(-1, x.shape[-1])).reshape(x.shape)
+        x = nn.relu(device + self.policy_pooled(pooled)[:, None])
         return jnp.where(mask, self.policy_head(x), ABSENT_LOGIT)
 
-    def _value(self, pooled: Array) -> Float[Array, " B"]:
+    def _value(self, pooled: Float[Array, "B two_h"]) -> Float[Array, " B"]:
         return self.value_head(nn.relu(self.value_hidden(pooled)))
 
     def logits(self, observation: Float[Array, "B obs_size"]) -> Float[Array, "B n"]:
-        """Unnormalised log-probabilities of the actions; :data:`ABSENT_LOGIT` where there is no device."""
+        """Return the unnormalised log-probabilities of the actions; :data:`ABSENT_LOGIT` where there is no device."""
         return self._logits(*self._encode(observation))
 
     def value(self, observation: Float[Array, "B obs_size"]) -> Float[Array, " B"]:
-        """State values."""
+        """Return the state values."""
         return self._value(self._encode(observation)[1])
 
-    def __call__(self, observation: Float[Array, "B obs_size"]) -> tuple[Array, Array]:
-        """Logits and values."""
+    def __call__(self, observation: Float[Array, "B obs_size"]) -> tuple[Float[Array, "B n"], Float[Array, " B"]]:
+        """Return logits and values."""
         x, pooled, mask = self._encode(observation)
         return self._logits(x, pooled, mask), self._value(pooled)
 
 
 ABSENT_LOGIT = -1e9
-"""Logit of an action that is no device."""
+"""Logit of an action that is not a device."""

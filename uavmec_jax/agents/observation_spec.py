@@ -1,15 +1,14 @@
-"""What a learner sees of a state, and the networks made for it: the paper's observation, or the full one."""
+"""The observations that PPO and A2C can learn from, the paper's and the full one, and the networks for each."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
-from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from uavmec_jax.agents.networks import ActorCritic, EquivariantActorCritic
 from uavmec_jax.env.dynamics import State
@@ -21,12 +20,12 @@ from uavmec_jax.planning.observation import FEATURES, observe_devices
 
 @dataclass(frozen=True)
 class ObservationSpec:
-    """One way to observation_fn.
+    """An observation and the networks that take it.
 
     Attributes:
-        observation_fn: ``(params, layout, state) -> [..., obs_size]`` f32; states may have batch axes in front.
-        obs_size: ``(n_devices) -> obs_size``.
-        network: ``(n_devices, hidden) -> actor and critic`` on batches ``[B, obs_size]``.
+        observation_fn: ``(params, layout, state) -> [..., obs_size]``, f32; states may have batch axes in front.
+        obs_size: ``(n_devices) -> obs_size``, the length of an observation.
+        network: ``(n_devices, hidden) -> module``, an actor and a critic that take observations ``[B, obs_size]``.
     """
 
     observation_fn: Callable[[Params, Layout, State], Array]
@@ -34,22 +33,24 @@ class ObservationSpec:
     network: Callable[[int, tuple[int, ...]], nn.Module]
 
 
-def _see_all(params: Params, layout: Layout, state: State) -> Array:
-    """The full observation, one device after the other, each with its mask behind its features."""
+def _flat_full_observation(params: Params, layout: Layout, state: State) -> Float[Array, "*batch obs_size"]:
+    """Return the full observation as one row: device after device, each with its features and then its mask."""
     if jnp.ndim(state.slot):
-        return jax.vmap(partial(_see_all, params, layout))(state)
-    seen = observe_devices(params, layout, state)
-    return jnp.concatenate([seen.features, seen.mask[:, None].astype(jnp.float32)], axis=1).reshape(-1)
+        return jax.vmap(partial(_flat_full_observation, params, layout))(state)
+    observation = observe_devices(params, layout, state)
+    rows = jnp.concatenate([observation.features, observation.mask[:, None].astype(jnp.float32)], axis=1)
+    return rows.reshape(-1)
 
 
-def _equivariant(n_devices: int, hidden: tuple[int, ...]) -> Any:
+def _equivariant_network(n_devices: int, hidden: tuple[int, ...]) -> EquivariantActorCritic:
+    """Return the networks for the full observation, which are the same for any number of devices."""
     return EquivariantActorCritic(n_features=len(FEATURES), hidden=hidden)
 
 
 OBSERVATIONS: Mapping[str, ObservationSpec] = MappingProxyType(
     {
         "paper": ObservationSpec(observe, lambda n: 2 * n, ActorCritic),
-        "full": ObservationSpec(_see_all, lambda n: n * (len(FEATURES) + 1), _equivariant),
+        "full": ObservationSpec(_flat_full_observation, lambda n: n * (len(FEATURES) + 1), _equivariant_network),
     }
 )
-"""Name, as in study files -> what is seen."""
+"""The observations by their names in study files."""

@@ -1,4 +1,4 @@
-"""The algorithms by name, each declared once: what may differ between agents, what shapes the program, how it is bound."""
+"""The algorithms by name. Each is declared once: its traced hyperparameters, its static settings, and how to bind them."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -10,16 +10,16 @@ from uavmec_jax.agents import a2c, dqn, ppo
 from uavmec_jax.agents.algorithm import Algorithm
 
 SCENARIO_SETTINGS = ("total_steps", "n_devices", "max_age")
-"""Static settings that follow from the study and its scenario."""
+"""Static settings that follow from the study and its scenarios, and are not set in files."""
 
 
 @dataclass(frozen=True)
 class RegisteredAlgorithm:
-    """One algorithm.
+    """The declaration of an algorithm.
 
     Attributes:
-        hyper: pytree of the traced hyperparameters.
-        spec: dataclass of the static settings.
+        hyper: class of the traced hyperparameters, a pytree.
+        spec: class of the static settings, a dataclass.
         bind: ``(spec) -> Algorithm``.
     """
 
@@ -39,16 +39,27 @@ class RegisteredAlgorithm:
         return tuple(name for name in names if name not in SCENARIO_SETTINGS)
 
     def spec_of(self, settings: Mapping[str, Any], **sizes: int) -> Any:
-        """The static settings among ``settings``, with those of :data:`SCENARIO_SETTINGS` that the algorithm has."""
+        """Return the static settings: those in ``settings`` and, of ``sizes``, those that the algorithm has.
+
+        Args:
+            settings: all settings of the algorithm, traced and static.
+            sizes: some of :data:`SCENARIO_SETTINGS`.
+        """
         fields = {field.name for field in dataclasses.fields(self.spec)}
-        chosen = {name: settings[name] for name in self.static}
-        return self.spec(**chosen, **{name: size for name, size in sizes.items() if name in fields})
+        static = {name: settings[name] for name in self.static}
+        return self.spec(**static, **{name: size for name, size in sizes.items() if name in fields})
 
     def make(self, settings: Mapping[str, Any], *, total_steps: int, n_devices: int, max_age: int) -> Algorithm:
-        """Bind the static settings among ``settings`` to a scenario's sizes.
+        """Return the algorithm with its static settings bound.
+
+        Args:
+            settings: all settings of the algorithm, traced and static.
+            total_steps: environment steps of one agent.
+            n_devices: number of devices.
+            max_age: largest data age that can occur, slots.
 
         Raises:
-            ValueError: they do not fit together.
+            ValueError: settings contradict each other.
         """
         return self.bind(self.spec_of(settings, total_steps=total_steps, n_devices=n_devices, max_age=max_age))
 
@@ -60,4 +71,4 @@ ALGORITHMS: Mapping[str, RegisteredAlgorithm] = MappingProxyType(
         "a2c": RegisteredAlgorithm(a2c.A2CHyper, a2c.A2CSpec, a2c.algorithm),
     }
 )
-"""Name, as in study files -> declaration."""
+"""The algorithms by their names in study files."""

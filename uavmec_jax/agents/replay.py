@@ -1,18 +1,22 @@
-"""Replay memory: one row of 32-bit words per transition, 64 bytes for twelve devices.
+"""The replay buffer: one row of 32-bit words per transition, 64 bytes for twelve devices.
 
-A row holds what a transition *adds*: the observation it led to, its action, reward and flags. The observation it
-started from is the previous row's, or the initial one if an episode ended there. So a sample costs two neighbouring
-buffer_state (two cache lines) instead of five scattered arrays, and 75 agents x 1,000,000 transitions fit in 4.5 GiB.
-Battery fractions and rewards are kept to the bit; ages are small integers and are packed.
+A row holds what a transition *adds*: the next observation, the action, the reward and flags. The observation before the
+transition is that of the previous row, or the initial one if an episode ended there. A sample therefore reads two
+neighbouring rows (two cache lines) instead of five scattered arrays, and 75 agents with 1,000,000 transitions each fit in
+4.5 GiB. Battery fractions and rewards are stored exactly; ages are small integers and are packed.
+
+The functions are pure; ``buffer_state`` is the array of all rows.
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt
+
+from uavmec_jax.env.types import Scalar
 
 _ACTION_BITS = 8
 _TERMINATED = 1 << _ACTION_BITS
@@ -20,32 +24,36 @@ _ENDED = 2 << _ACTION_BITS
 
 
 class Transition(NamedTuple):
-    """A batch of transitions, leading axis ``B``.
+    """A batch of transitions.
 
-    ``observation`` and ``next_observation`` are f32 ``[B, 2n]``, ``action`` int32 ``[B]``, ``reward`` f32 ``[B]``,
-    ``terminated`` f32 ``[B]`` (1 where the bootstrap is cut), ``discount`` f32 ``[B]`` of the bootstrap. With n-step
-    returns the reward is the discounted sum up to ``next_observation``.
+    Attributes:
+        observation: the paper's observation before the action.
+        action: the device visited.
+        reward: the reward; with n-step returns the discounted sum of the rewards up to ``next_observation``.
+        terminated: 1 if the episode terminated in ``next_observation``, so that nothing is bootstrapped from it, else 0.
+        next_observation: the observation to bootstrap from.
+        discount: discount factor of the bootstrapped value.
     """
 
-    observation: Array
-    action: Array
-    reward: Array
-    terminated: Array
-    next_observation: Array
-    discount: Array
+    observation: Float[Array, "*batch B obs_size"]
+    action: Int[Array, "*batch B"]
+    reward: Float[Array, "*batch B"]
+    terminated: Float[Array, "*batch B"]
+    next_observation: Float[Array, "*batch B obs_size"]
+    discount: Float[Array, "*batch B"]
 
 
 @dataclass(frozen=True)
 class ReplaySpec:
-    """Shape of one agent's memory (static).
+    """Shape of one agent's replay buffer (static).
 
     Attributes:
-        n_devices: devices, at most 256.
-        capacity: transitions that can be sampled.
-        stride: transitions written at a time; the ring is a multiple of it, so a write never wraps.
+        n_devices: number of devices, at most 256.
+        capacity: number of transitions that can be sampled.
+        stride: number of transitions written at a time; the ring is a multiple of it, so no single write wraps around.
         max_age: largest age that can occur, slots.
-        wraps: whether more than ``capacity`` transitions will ever be written.
-        n_step: transitions that one sample sums up.
+        wraps: whether more than ``capacity`` transitions will be written.
+        n_step: number of transitions that one sample sums up.
     """
 
     n_devices: int
@@ -57,23 +65,26 @@ class ReplaySpec:
 
     @property
     def ring(self) -> int:
-        """Transitions held: the capacity plus at least the one whose start the oldest needs, in whole strides."""
-        held = self.capacity + (1 if self.wraps else 0)
-        return -(-held // self.stride) * self.stride
+        """Number of transitions held: the capacity, one more if the ring wraps, rounded up to whole strides.
+
+        The oldest sample needs the row before its own.
+        """
+        needed = self.capacity + (1 if self.wraps else 0)
+        return -(-needed // self.stride) * self.stride
 
     @property
     def age_bits(self) -> int:
-        """Bits per packed age."""
+        """Number of bits of a packed age."""
         return max(int(self.max_age).bit_length(), 1)
 
     @property
     def ages_per_word(self) -> int:
-        """Ages in one 32-bit word."""
+        """Number of ages in a 32-bit word."""
         return 32 // self.age_bits
 
     @property
     def words(self) -> int:
-        """Words per row: batteries, packed ages, reward, and one for action and flags."""
+        """Number of words in a row: batteries, packed ages, the reward, and one word for the action and the flags."""
         return self.n_devices + -(-self.n_devices // self.ages_per_word) + 2
 
     @property
@@ -82,8 +93,8 @@ class ReplaySpec:
         return 4 * (self.ring + 1) * self.words
 
 
-def init(spec: ReplaySpec) -> UInt[Array, "buffer_state words"]:
-    """An empty memory ``[ring + 1, words]``; row 0 stands before the first transition: an episode ended there."""
+def init(spec: ReplaySpec) -> UInt[Array, "rows words"]:
+    """Return an empty buffer, ``[ring + 1, words]``. Row 0, before the first transition, says that an episode ended."""
     buffer_state = jnp.zeros((spec.ring + 1, spec.words), jnp.uint32)
     return buffer_state.at[0, -1].set(_ENDED)
 
@@ -97,7 +108,17 @@ def pack(
     terminated: Bool[Array, ""],
     ended: Bool[Array, ""],
 ) -> UInt[Array, " words"]:
-    """One row from what a slot led to; ``ended`` is terminated or truncated."""
+    """Pack a transition into one row.
+
+    Args:
+        spec: shape of the buffer.
+        action: the device visited.
+        reward: the reward.
+        battery_fraction: each device's battery after the slot, a share of its capacity.
+        age: each device's data age after the slot.
+        terminated: whether the episode terminated.
+        ended: whether the episode terminated or was truncated.
+    """
     words = -(-spec.n_devices // spec.ages_per_word)
     padded = jnp.pad(age.astype(jnp.uint32), (0, words * spec.ages_per_word - spec.n_devices))
     shifts = np.arange(spec.ages_per_word, dtype=np.uint32) * spec.age_bits
@@ -110,46 +131,46 @@ def pack(
 
 def add(
     spec: ReplaySpec,
-    buffer_state: UInt[Array, "buffer_state words"],
+    buffer_state: UInt[Array, "rows words"],
     written: Int[Array, ""],
-    new: UInt[Array, "stride words"],
-) -> UInt[Array, "buffer_state words"]:
-    """Write ``stride`` buffer_state; ``written`` (a multiple of ``stride``) transitions were written before."""
-    place = written % spec.ring
-    buffer_state = jax.lax.dynamic_update_slice(buffer_state, new, (place + 1, 0))
-    if spec.wraps:  # row 0 is the neighbour of row 1: once the ring is full, the ring's last row
-        first = jnp.where(place + spec.stride == spec.ring, new[-1], buffer_state[0])
+    new_rows: UInt[Array, "stride words"],
+) -> UInt[Array, "rows words"]:
+    """Write ``stride`` rows; ``written`` transitions, a multiple of ``stride``, were written before."""
+    position = written % spec.ring
+    buffer_state = jax.lax.dynamic_update_slice(buffer_state, new_rows, (position + 1, 0))
+    if spec.wraps:  # row 0 is what row 1 follows: once the ring is full, a copy of the ring's last row
+        first = jnp.where(position + spec.stride == spec.ring, new_rows[-1], buffer_state[0])
         buffer_state = jax.lax.dynamic_update_slice(buffer_state, first[None], (0, 0))
     return buffer_state
 
 
 def sample(
     spec: ReplaySpec,
-    buffer_state: UInt[Array, "buffer_state words"],
+    buffer_state: UInt[Array, "rows words"],
     written: Int[Array, ""],
     bits: UInt[Array, " B"],
-    gamma: Any,
+    gamma: Scalar,
 ) -> Transition:
-    """Draw transitions uniformly with replacement from the newest ``min(written, capacity)``.
+    """Sample transitions uniformly, with replacement, from the newest ``min(written, capacity)``.
 
     Args:
-        spec: shape of the memory.
-        buffer_state: the memory.
-        written: transitions written so far, at least 1.
-        bits: ``[B]`` uniform 32-bit words, one per draw. (The modulo's bias is below capacity / 2**32.)
-        gamma: discount of one slot.
+        spec: shape of the buffer.
+        buffer_state: the rows.
+        written: number of transitions written so far, at least 1.
+        bits: one uniform 32-bit word per sample. (The bias of the modulo is below capacity / 2**32.)
+        gamma: discount factor of one slot.
     """
     size = jnp.minimum(written, spec.capacity)
     back = (bits % size.astype(jnp.uint32)).astype(jnp.int32)
-    place = (written - 1 - back) % spec.ring
-    pairs = jax.vmap(lambda start: jax.lax.dynamic_slice(buffer_state, (start, 0), (2, spec.words)))(place)
+    position = (written - 1 - back) % spec.ring
+    pairs = jax.vmap(lambda start: jax.lax.dynamic_slice(buffer_state, (start, 0), (2, spec.words)))(position)
     before, row = pairs[:, 0], pairs[:, 1]
-    first = np.concatenate([np.ones(spec.n_devices, np.float32), np.zeros(spec.n_devices, np.float32)])
+    initial = np.concatenate([np.ones(spec.n_devices, np.float32), np.zeros(spec.n_devices, np.float32)])
     reward, discount, last = _reward(row), jnp.broadcast_to(jnp.asarray(gamma, jnp.float32), back.shape), row
     if spec.n_step > 1:
-        reward, discount, last = _n_step(spec, buffer_state, place, back, row, gamma)
+        reward, discount, last = _n_step(spec, buffer_state, position, back, row, gamma)
     return Transition(
-        observation=jnp.where((before[:, -1:] & _ENDED) > 0, first, _observation(spec, before)),
+        observation=jnp.where((before[:, -1:] & _ENDED) > 0, initial, _observation(spec, before)),
         action=(row[:, -1] & (_TERMINATED - 1)).astype(jnp.int32),
         reward=reward,
         terminated=((last[:, -1] & _TERMINATED) > 0).astype(jnp.float32),
@@ -160,35 +181,43 @@ def sample(
 
 def _n_step(
     spec: ReplaySpec,
-    buffer_state: UInt[Array, "buffer_state words"],
-    place: Int[Array, " B"],
+    buffer_state: UInt[Array, "rows words"],
+    position: Int[Array, " B"],
     back: Int[Array, " B"],
     row: UInt[Array, "B words"],
-    gamma: Any,
-) -> tuple[Array, Array, Array]:
-    """Discounted sum of up to ``n_step`` rewards, discount of the bootstrap, and the last row summed.
+    gamma: Scalar,
+) -> tuple[Float[Array, " B"], Float[Array, " B"], UInt[Array, "B words"]]:
+    """Return the discounted sum of up to ``n_step`` rewards, the discount of the bootstrap, and the last row summed.
 
-    A sum stops where an episode ends and at the newest transition, as in Stable-Baselines3; it is then bootstrapped
-    after the slots it has.
+    A sum stops where an episode ends and at the newest transition, as in Stable-Baselines3, and is bootstrapped there.
+
+    Args:
+        spec: shape of the buffer.
+        buffer_state: the rows.
+        position: place of each sample's first transition in the ring.
+        back: number of transitions written after it.
+        row: its row.
+        gamma: discount factor of one slot.
     """
-    goes_on = jnp.ones(place.shape, bool)
-    total, discount, last = jnp.zeros(place.shape), jnp.ones(place.shape), row
+    continues = jnp.ones(position.shape, bool)
+    total, discount, last = jnp.zeros(position.shape), jnp.ones(position.shape), row
     for k in range(spec.n_step):
-        now = buffer_state[1 + (place + k) % spec.ring]
-        goes_on = goes_on & (back >= k)
-        total = total + jnp.where(goes_on, discount * _reward(now), 0.0)
-        discount = jnp.where(goes_on, discount * gamma, discount)
-        last = jnp.where(goes_on[:, None], now, last)
-        goes_on = goes_on & ((now[:, -1] & _ENDED) == 0)
+        current = buffer_state[1 + (position + k) % spec.ring]
+        continues = continues & (back >= k)
+        total = total + jnp.where(continues, discount * _reward(current), 0.0)
+        discount = jnp.where(continues, discount * gamma, discount)
+        last = jnp.where(continues[:, None], current, last)
+        continues = continues & ((current[:, -1] & _ENDED) == 0)
     return total, discount, last
 
 
 def _reward(row: UInt[Array, "B words"]) -> Float[Array, " B"]:
+    """Unpack the rewards of rows."""
     return jax.lax.bitcast_convert_type(row[:, -2], jnp.float32)
 
 
 def _observation(spec: ReplaySpec, row: UInt[Array, "B words"]) -> Float[Array, "B two_n"]:
-    """The observation a row led to."""
+    """Unpack the next observations of rows."""
     n = spec.n_devices
     shifts = (np.arange(n, dtype=np.uint32) % spec.ages_per_word) * spec.age_bits
     words = jnp.repeat(row[:, n:-2], spec.ages_per_word, axis=-1)[:, :n]

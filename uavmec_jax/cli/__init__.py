@@ -1,4 +1,4 @@
-"""The command `uavmec`: parse, call, print. The work is done in the package; jax is imported only when it is needed."""
+"""The command `uavmec`: parse, call, print. The rest of the package does the work; JAX is imported only when needed."""
 
 from typing import Any
 
@@ -16,10 +16,14 @@ from uavmec_jax.errors import UserError
 
 
 class UavmecGroup(click.Group):
-    """A group whose commands report wrong input, or a full or closed disk, in one line."""
+    """A group whose commands report wrong input and failures of the file system in one line."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command."""
+        """Run the command.
+
+        Raises:
+            InputError: a UserError or an OSError ended it.
+        """
         try:
             return super().invoke(ctx)
         except UserError as error:
@@ -35,13 +39,13 @@ def main() -> None:
 
     \b
     uavmec run table5 --quick         the paper's Table 5 on this machine, in under a minute
-    uavmec run my-study.toml          a study of your own
+    uavmec run my-study.toml          your own study
     uavmec resume runs/...            resume a run that was stopped or killed
-    uavmec status runs/...            how far a run is
-    uavmec search dqn                 better settings: trials in batches, each batch one program
+    uavmec status runs/...            the progress of a run
+    uavmec search dqn                 better hyperparameters: batches of trials, each batch one program
     uavmec advise my-scenario.toml    which device to visit next, what will fail first; no training needed
     uavmec plan my-scenario.toml      tours for your own devices, what fails first, what to repair
-    uavmec show runs/...              the tables of a run again
+    uavmec show runs/...              the tables of a run
     uavmec traffic show albany        an evacuation, and how much traffic each device sees
     uavmec evaluate runs/...          a policy of a run on one scenario
     uavmec compare runs/a runs/b      two runs, seed by seed

@@ -1,4 +1,4 @@
-"""The command that advises: which device to visit next, how long the network lasts, what fails first."""
+"""The command `advise`: which device to visit next, how long the network will last, what will fail first."""
 
 from pathlib import Path
 
@@ -10,11 +10,13 @@ from uavmec_jax.cli.options import ScenarioChoice, json_option, scenario_options
 
 @click.command()
 @scenario_options(argument=True)
-@click.option("--state", type=click.Path(path_type=Path), help="The present state (JSON; default: the initial one).")
-@click.option("--policy", default="generalist", help="A policy by name or from a file (default: generalist).")
-@click.option("--samples", type=int, default=256, help="Futures simulated for each candidate (default: 256).")
-@click.option("--what-if/--no-what-if", default=True, help="Try every repair and removal of a device too.")
-@click.option("--price", type=float, help="Slots of life that the first failure of the busiest device costs (0: none).")
+@click.option(
+    "--state", type=click.Path(path_type=Path), help="File of the current state, JSON (default: the initial state)."
+)
+@click.option("--policy", default="generalist", help="Name or file of the policy to follow (default: generalist).")
+@click.option("--samples", type=int, default=256, help="Futures to simulate for each candidate (default: 256).")
+@click.option("--what-if/--no-what-if", default=True, help="Also evaluate every repair and removal of a device.")
+@click.option("--price", type=float, help="Price of a first failure of the busiest device, in slots of lifetime.")
 @json_option
 def advise(
     scenario: ScenarioChoice,
@@ -25,7 +27,7 @@ def advise(
     price: float | None,
     as_json: bool,
 ) -> None:
-    """Advise on the next visit in SCENARIO, a file (TOML or CSV), or in a random scenario; nothing is trained."""
+    """Recommend the next visit in SCENARIO, a file (TOML or CSV), or in a random scenario; nothing is trained."""
     if not 2 <= samples <= 100_000:
         raise InputError(f"--samples is {samples}; give 2 to 100000 futures")
     from rich.console import Console

@@ -1,4 +1,4 @@
-"""What the commands share: one line for wrong input, settings from the command line, tables on the terminal."""
+"""Shared by the commands: errors in one line, settings from the command line, tables on the terminal."""
 
 import json
 import sys
@@ -13,7 +13,7 @@ _EXAMPLES = {"--set": "--set dqn.gamma=0.99"}
 
 
 class InputError(click.ClickException):
-    """Wrong input: one line on standard error, exit code 2."""
+    """Wrong input: the message is printed in one line on standard error; the exit code is 2."""
 
     exit_code = 2
 
@@ -23,9 +23,10 @@ class InputError(click.ClickException):
 
 
 class Interrupt(click.ClickException):
-    """A signal ended the command: how to go on, and the exit code that shells expect."""
+    """A signal ended the command; the exit code is 128 + the signal's number, as shells expect."""
 
     def __init__(self, message: str, signal: int) -> None:
+        """Make the exception; ``message`` says how to continue."""
         super().__init__(message)
         self.exit_code: int = 128 + signal  # type: ignore[misc]
 
@@ -35,10 +36,10 @@ class Interrupt(click.ClickException):
 
 
 def assignment(text: str, option: str = "--set") -> tuple[str, Any]:
-    """Parse ``name=value`` with the value as in TOML; a bare word is a string.
+    """Parse ``NAME=VALUE``, with the value as in TOML; a bare word is a string.
 
     Raises:
-        InputError: there is no ``=`` or no name.
+        InputError: the equals sign or the name is missing.
     """
     name, equals, value = text.partition("=")
     if not equals or not name.strip():
@@ -55,7 +56,7 @@ def print_json(data: Any) -> None:
 
 
 def print_results(results: Any, directory: Path, console: Any, as_json: bool) -> None:
-    """Print the tables of a run, or its cells as JSON."""
+    """Print the tables of a run; as JSON, its label and its cells."""
     from uavmec_jax.reporting.tables import summary, tables
     from uavmec_jax.studies.first_failures import place_frames
 
@@ -69,7 +70,7 @@ def print_results(results: Any, directory: Path, console: Any, as_json: bool) ->
 
 
 def print_tables(console: Any, tables: dict[str, Any], lines: list[str], directory: Path | None = None) -> None:
-    """Print titled tables, lines below them, and where the files are."""
+    """Print tables with their titles, lines below them, and the folder of the files."""
     for title, table in tables.items():
         console.print(f"[bold]{title}[/bold]")
         console.print(table)
@@ -80,10 +81,10 @@ def print_tables(console: Any, tables: dict[str, Any], lines: list[str], directo
 
 
 def new_folder(name: str) -> Path:
-    """Return the folder of a run or a tour unless the user names one."""
+    """Return the default folder of a run, a search or a tour."""
     return Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
 def command_line() -> str:
-    """Return the command as it was given, for the labels of results."""
+    """Return the command line, for the labels of results."""
     return " ".join(["uavmec", *sys.argv[1:]])

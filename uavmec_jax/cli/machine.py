@@ -9,7 +9,7 @@ from uavmec_jax.cli.options import json_option
 @click.command()
 @json_option
 def doctor(as_json: bool) -> None:
-    """Print versions, devices and memory, and measure the speed for two seconds."""
+    """Print versions, devices and memory, and measure the speed of the environment for two seconds."""
     from uavmec_jax.training import host
 
     host.use_all_cores()

@@ -1,4 +1,4 @@
-"""Commands about runs under way: resumed, watched, shared by several workers."""
+"""Commands about existing runs: resume, status, and workers that share a run."""
 
 import os
 from collections.abc import Callable
@@ -22,17 +22,17 @@ from uavmec_jax.runs.options import RunOptions
 directory_argument = click.argument("directory", type=click.Path(path_type=Path))
 
 _EVENTS = {
-    "damaged": "shard {shard}: {error}; it is set aside",
+    "damaged": "shard {shard}: {error}; the file is renamed and not used",
     "restored": "shard {shard} resumes from {file}, step {steps:,}",
     "failed": "shard {shard} failed: {error}",
     "lost": "{error}",
     "died": "worker {pid} died (exit code {exit_code}); the others take over",
 }
-"""The events of a run that a person should see."""
+"""Events of a run that are printed, and how."""
 
 
 def event_printer(console: Any) -> Callable[[str, dict[str, Any]], None]:
-    """Return a function that prints those events of a run that a person should see."""
+    """Return an ``on_event`` that prints the events that a user should see."""
 
     def print_event(event: str, facts: dict[str, Any]) -> None:
         if event in _EVENTS:
@@ -42,10 +42,10 @@ def event_printer(console: Any) -> Callable[[str, dict[str, Any]], None]:
 
 
 def report_results(results: Any, directory: Path, console: Any, as_json: bool) -> None:
-    """Print tables and draw the figure of what is finished.
+    """Print the tables and draw the figure of a run.
 
     Raises:
-        Interrupt: that is not all of the run; it says how to go on.
+        Interrupt: the run was stopped; the message says how to resume it.
     """
     from uavmec_jax.reporting import canvas, figures
 
@@ -54,16 +54,20 @@ def report_results(results: Any, directory: Path, console: Any, as_json: bool) -
         print_results(results, directory, console, as_json)
     if not results.run["complete"]:
         finished = f"{len(results.agents):,} of {results.run['agents']:,} agents are finished"
-        raise Interrupt(f"{finished}; go on with: uavmec resume {directory}", results.run["stopped_by"])
+        raise Interrupt(f"{finished}; resume with: uavmec resume {directory}", results.run["stopped_by"])
 
 
 @click.command()
 @directory_argument
-@click.option("--workers", type=click.IntRange(1, 256), help="Processes on this machine (default: as planned).")
-@click.option("--other-code", is_flag=True, help="Resume although code or libraries changed; the bits may differ.")
+@click.option(
+    "--workers", type=click.IntRange(1, 256), help="Number of processes on this machine (default: as planned)."
+)
+@click.option(
+    "--other-code", is_flag=True, help="Resume although code or libraries have changed; the results may differ."
+)
 @json_option
 def resume(directory: Path, workers: int | None, other_code: bool, as_json: bool) -> None:
-    """Resume the run in DIRECTORY, which was stopped or killed; it ends with the same bits."""
+    """Resume the run in DIRECTORY after it was stopped or killed; the results are those of an uninterrupted run."""
     from uavmec_jax.training import host
 
     host.use_all_cores()
@@ -91,17 +95,17 @@ def resume(directory: Path, workers: int | None, other_code: bool, as_json: bool
 @directory_argument
 @json_option
 def status(directory: Path, as_json: bool) -> None:
-    """Print how far the run in DIRECTORY is: shards, speed, time left, disk."""
+    """Print the progress of the run in DIRECTORY: shards, speed, time left, disk usage."""
     from rich.console import Console
 
     from uavmec_jax.reporting.status import status_lines
     from uavmec_jax.runs.status import run_status
 
-    found = run_status(directory)
+    current = run_status(directory)
     if as_json:
-        print_json(found.as_json())
+        print_json(current.as_json())
         return
-    for line in status_lines(found):
+    for line in status_lines(current):
         Console().print(line, highlight=False, soft_wrap=True)
 
 
@@ -109,10 +113,10 @@ def status(directory: Path, as_json: bool) -> None:
 @directory_argument
 @click.option("--share", metavar="I/N", help="Use the I-th of N equal parts of this machine's cores.")
 @click.option(
-    "--no-wait", is_flag=True, help="End when no shard is free, instead of waiting to take over from the dead."
+    "--no-wait", is_flag=True, help="End when no shard is free, instead of waiting to take over from dead workers."
 )
 def worker(directory: Path, share: str | None, no_wait: bool) -> None:
-    """Work on the run in DIRECTORY beside others, on this machine or on any that shares the folder."""
+    """Join the workers of the run in DIRECTORY, on this machine or on any that shares the folder."""
     from uavmec_jax.training import host
 
     host.use_all_cores(_share(share))
@@ -124,31 +128,37 @@ def worker(directory: Path, share: str | None, no_wait: bool) -> None:
     try:
         complete = work_on(directory, wait=not no_wait, on_event=event_printer(Console()))
     except Interrupted as stop:
-        raise Interrupt(f"progress is saved; start another with: uavmec worker {directory}", stop.signal) from stop
-    click.echo(
-        f"{directory}: {'complete' if complete else 'no shard is free; others are still at work or have failed'}"
-    )
+        raise Interrupt(
+            f"progress is saved; start a worker again with: uavmec worker {directory}", stop.signal
+        ) from stop
+    click.echo(f"{directory}: {'complete' if complete else 'no shard is free; some are still running or have failed'}")
 
 
 def _share(text: str | None) -> tuple[int, int] | None:
-    """``I/N`` as numbers from 1."""
+    """Parse ``I/N``, numbers from 1."""
     if text is None:
         return None
-    part, slash, of = text.partition("/")
-    if not slash or not part.isdigit() or not of.isdigit() or not 1 <= int(part) <= int(of):
+    part, slash, parts = text.partition("/")
+    if not slash or not part.isdigit() or not parts.isdigit() or not 1 <= int(part) <= int(parts):
         raise InputError(f"--share {text}: give I/N, e.g. 1/2 for the first half of the cores")
-    return int(part), int(of)
+    return int(part), int(parts)
 
 
 @click.command()
 @click.argument("study")
-@click.option("--jobs", type=click.IntRange(1, 10_000), required=True, help="Workers to start on the cluster.")
-@click.option("--executor", default="slurm", help="Of submitit: slurm, local or debug (default: slurm).")
 @click.option(
-    "--with", "parameters", multiple=True, metavar="NAME=VALUE", help="For submitit, e.g. --with slurm_partition=cpu."
+    "--jobs", type=click.IntRange(1, 10_000), required=True, help="Number of workers to start on the cluster."
+)
+@click.option("--executor", default="slurm", help="Executor of submitit: slurm, local or debug (default: slurm).")
+@click.option(
+    "--with",
+    "parameters",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="Parameter of submitit, e.g. --with slurm_partition=cpu.",
 )
 @set_option(help="Override any setting, as in `uavmec run`.")
-@out_option(help="Folder of the run, which all hosts must see.")
+@out_option(help="Folder of the run, which all machines must share.")
 @run_options
 def submit(
     study: str,
@@ -184,9 +194,9 @@ def submit(
         )
         return directory.absolute()
 
-    names = submit_workers(prepare, jobs, executor, dict(assignment(one, "--with") for one in parameters))
+    names = submit_workers(prepare, jobs, executor, dict(assignment(text, "--with") for text in parameters))
     click.echo(f"{directory}: {len(names)} workers submitted ({', '.join(names[:4])}{', ...' * (len(names) > 4)})")
-    click.echo(f"how far it is: uavmec status {directory}; the results, when it is complete: uavmec show {directory}")
+    click.echo(f"progress: uavmec status {directory}; results, once complete: uavmec show {directory}")
 
 
 def print_simulation(
@@ -198,7 +208,7 @@ def print_simulation(
     options: RunOptions,
     as_json: bool,
 ) -> None:
-    """Print what a run would take at a given speed.
+    """Print how long a run would take at a given speed, and how much disk space and memory.
 
     Raises:
         InputError: no speed is given.
@@ -208,11 +218,12 @@ def print_simulation(
 
     if speed is None:
         raise InputError(
-            "--simulate needs --speed, the training steps per second of one device; `uavmec doctor` measures it"
+            "--simulate needs --speed, the training steps per second of one device: training_steps_per_second in the "
+            "run.json of an earlier run, divided by its devices"
         )
     plan = plan_run(study, workers=workers, shard_size=shard_size)
-    found = simulate(study, plan, speed=speed, devices=devices or os.cpu_count() or 1, options=options)
+    estimate = simulate(study, plan, speed=speed, devices=devices or os.cpu_count() or 1, options=options)
     if as_json:
-        print_json(found.as_json())
+        print_json(estimate.as_json())
     else:
-        click.echo(f"{study.name}: {plan}\n{found}")
+        click.echo(f"{study.name}: {plan}\n{estimate}")

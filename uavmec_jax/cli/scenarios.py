@@ -13,12 +13,12 @@ _MAX_DRAWS = 10_000
 
 @click.command()
 @scenario_options(argument=True)
-@click.option("--draws", type=int, default=8, help="Volume draws that lifetimes are evaluated on (default: 8).")
-@click.option("--width", type=int, default=256, help="States the beam keeps (default: 256).")
+@click.option("--draws", type=int, default=8, help="Number of volume draws to evaluate lifetimes on (default: 8).")
+@click.option("--width", type=int, default=256, help="Width of the beam: the number of states it keeps (default: 256).")
 @out_option(help="Folder of the tour (default: runs/plan-<time>).")
 @json_option
 def plan(scenario: ScenarioChoice, draws: int, width: int, out: Path | None, as_json: bool) -> None:
-    """Plan tours for SCENARIO, a file (TOML or CSV), or for a random scenario: bound, first failure, repairs."""
+    """Plan tours for SCENARIO, a file (TOML or CSV), or for a random scenario; bound, first failure, repairs."""
     if not 1 <= width <= 100_000:
         raise InputError(f"--width is {width}; give 1 to 100000 states")
     _check_draws(draws)
@@ -34,22 +34,27 @@ def plan(scenario: ScenarioChoice, draws: int, width: int, out: Path | None, as_
     named = scenario.load()
     directory = out or new_folder("plan")
     check_directory(directory)
-    made = make_plan(named.params, named.layout, named.draws(draws), width=width)
-    save_plan(made, named, directory, command_line())
+    result = make_plan(named.params, named.layout, named.draws(draws), width=width)
+    save_plan(result, named, directory, command_line())
     if as_json:
-        print_json(plan_data(made, named.device_names, named.name))
+        print_json(plan_data(result, named.device_names, named.name))
         return
     names = named.device_names
-    print_tables(Console(), plan_tables(made, names), plan_summary(made, names), directory)
+    print_tables(Console(), plan_tables(result, names), plan_summary(result, names), directory)
 
 
 @click.command()
 @click.argument("policy")
 @scenario_options(argument=False)
-@click.option("--draws", type=int, default=32, help="Volume draws that it is evaluated on (default: 32).")
-@click.option("--weights", type=click.Choice(["best", "last"]), default="best", help="Of a run's agent.")
-@click.option("--agent", multiple=True, metavar="NAME=VALUE", help="Which agent of a run, e.g. --agent algorithm=ppo.")
-@click.option("--save", type=click.Path(path_type=Path), help="Write the agent's policy to a file of its own.")
+@click.option("--draws", type=int, default=32, help="Number of volume draws (default: 32).")
+@click.option("--weights", type=click.Choice(["best", "last"]), default="best", help="Which weights of a run's agent.")
+@click.option(
+    "--agent",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="Which agent of a run, by its axes, e.g. --agent algorithm=ppo.",
+)
+@click.option("--save", type=click.Path(path_type=Path), help="Save the trained policy to a file.")
 @json_option
 def evaluate(
     policy: str,
@@ -62,7 +67,7 @@ def evaluate(
 ) -> None:
     """Evaluate POLICY on one scenario: a policy file, the folder of a run, or a name (generalist, oldest-first, ...).
 
-    Of a run it is by default the agent that was trained on the chosen scenario.
+    From a run, the policy is by default that of the agent trained on the chosen scenario.
     """
     _check_draws(draws)
     from rich.console import Console
@@ -71,7 +76,7 @@ def evaluate(
     from uavmec_jax.scenarios.policies import TrainedPolicy, draws_scenarios, load_policy
     from uavmec_jax.studies.policy_evaluation import evaluate_policy
 
-    axes = dict(assignment(one, "--agent") for one in agent)
+    axes = dict(assignment(text, "--agent") for text in agent)
     if Path(policy).is_dir() and scenario.file is None and not draws_scenarios(Path(policy)):
         axes = scenario.axes | axes
     chosen = load_policy(policy, weights, **axes)
@@ -96,7 +101,7 @@ def evaluate(
 
 
 def _training_lines(trained: Any, named: Any, scenario: ScenarioChoice) -> list[str]:
-    """What the policy was trained on, and how the scenario differs."""
+    """Say what the policy was trained on, and how the scenario differs from that."""
     axes = ", ".join(f"{name} {value}" for name, value in trained.trained_on.items())
     lines = [f"Trained by {trained.algorithm.upper()} on {axes}."]
     lines += [f"Out of distribution: {line}." for line in trained.out_of_distribution(named.params, named.layout)]
@@ -106,11 +111,12 @@ def _training_lines(trained: Any, named: Any, scenario: ScenarioChoice) -> list[
     )
     if trained.n_devices is not None and elsewhere:
         lines.append(
-            "This is another scenario: the policy's observation holds no positions, so nothing it learned need hold here."
+            "This is another scenario: its observation has no positions, so the policy may not transfer to it."
         )
     return lines
 
 
 def _check_draws(draws: int) -> None:
+    """Raise an InputError unless the number of draws is in range."""
     if not 1 <= draws <= _MAX_DRAWS:
         raise InputError(f"--draws is {draws}; give a whole number from 1 to {_MAX_DRAWS}")

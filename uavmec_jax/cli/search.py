@@ -1,4 +1,4 @@
-"""The command that searches hyperparameters."""
+"""The command `search`: hyperparameter search."""
 
 import math
 from pathlib import Path
@@ -14,14 +14,16 @@ _SIGINT = 2
 
 @click.command()
 @click.argument("space")
-@click.option("--trials", type=click.IntRange(1), help="Trials in all; a larger number continues a finished search.")
+@click.option(
+    "--trials", type=click.IntRange(1), help="Total number of trials; a larger number continues a finished search."
+)
 @out_option(help="Folder of the search (default: runs/<space>-<time>).")
-@click.option("--no-confirm", is_flag=True, help="Leave out the comparison on the study's own scenarios.")
+@click.option("--no-confirm", is_flag=True, help="Skip the comparison on the study's own scenarios.")
 @json_option
 def search(space: str, trials: int | None, out: Path | None, no_confirm: bool, as_json: bool) -> None:
-    """Search settings of a study as SPACE says: a space that ships with the package (dqn) or a TOML file.
+    """Search hyperparameters in SPACE: a search space that ships with the package (dqn), or a TOML file.
 
-    With the folder of a search that was stopped as --out, continues it.
+    To continue a search that was stopped, give its folder as --out.
     """
     from uavmec_jax.training import host
 
@@ -41,26 +43,28 @@ def search(space: str, trials: int | None, out: Path | None, no_confirm: bool, a
     try:
         with console.status("compiling") as line:
             result = run_search(
-                loaded, directory, command=command_line(), on_progress=lambda news: line.update(_describe(news))
+                loaded, directory, command=command_line(), on_progress=lambda progress: line.update(_describe(progress))
             )
             for name, figure in (("history", history_figure(result)), ("importance", importance_figure(result))):
                 canvas.save(figure, directory / f"{name}.png")
             data: dict[str, Any] = search_json(result)
             tables = search_tables(result)
             if loaded.confirm_seeds and not no_confirm:
-                own, best = confirm(
+                sides = confirm(
                     result,
                     directory,
                     command=command_line(),
-                    on_progress=lambda name, news: line.update(f"{name} settings: {news.steps / news.total_steps:.0%}"),
+                    on_progress=lambda name, progress: line.update(
+                        f"{name} settings: {progress.steps / progress.total_steps:.0%}"
+                    ),
                 )
-                more, compared = comparison(own, best)
+                compared, differences = comparison(*sides)
                 tables |= {
-                    f"On scenarios that the search has not seen. {title}": table for title, table in more.items()
+                    f"On scenarios that the search has not seen. {title}": table for title, table in compared.items()
                 }
-                data["gain"] = compared["overall"]
+                data["gain"] = differences["overall"]
     except KeyboardInterrupt as error:
-        raise Interrupt(f"go on with: uavmec search {space} --out {directory}", _SIGINT) from error
+        raise Interrupt(f"continue with: uavmec search {space} --out {directory}", _SIGINT) from error
     if as_json:
         print_json(data)
         return
@@ -68,5 +72,7 @@ def search(space: str, trials: int | None, out: Path | None, no_confirm: bool, a
 
 
 def _describe(progress: Any) -> str:
+    """Describe the progress of a search in one line."""
     best = "" if math.isnan(progress.best) else f", best {progress.best:.2f} slots"
-    return f"trial {progress.trials} of {progress.total_trials}{best}; batch {progress.share:.0%}, {progress.left} trials left"
+    batch = f"batch {progress.batch_share:.0%}, {progress.batch_trials} trials in training"
+    return f"{progress.trials} of {progress.total_trials} trials{best}; {batch}"

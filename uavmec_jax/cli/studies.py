@@ -1,4 +1,4 @@
-"""Commands about studies and the runs they leave."""
+"""Commands about studies and their results."""
 
 from pathlib import Path
 from typing import Any
@@ -16,15 +16,15 @@ QUICK_STEPS, QUICK_SEEDS, QUICK_VALIDATE_EVERY = 50_000, 3, 5_000
 @click.command()
 @click.argument("study")
 @click.option("--seeds", type=int, help="Number of seeds (axes.seeds).")
-@click.option("--steps", type=int, help="Environment steps of one agent.")
+@click.option("--steps", type=int, help="Environment steps per agent.")
 @click.option(
-    "--quick", is_flag=True, help=f"{QUICK_SEEDS} seeds x {QUICK_STEPS:,} steps: a first look within a minute."
+    "--quick", is_flag=True, help=f"{QUICK_SEEDS} seeds x {QUICK_STEPS:,} steps: first results within a minute."
 )
 @set_option(help="Override any setting, e.g. --set dqn.gamma=0.99 or --set axes.learning_rate=[0.001,0.0071].")
 @out_option(help="Folder of the run (default: runs/<study>-<time>).")
 @json_option
 @run_options
-@click.option("--simulate", is_flag=True, help="Print what the run would take, and run nothing.")
+@click.option("--simulate", is_flag=True, help="Estimate wall time, disk space and memory, and run nothing.")
 @click.option("--speed", type=float, help="For --simulate: training steps per second of one device.")
 @click.option("--devices", type=int, help="For --simulate: number of devices (default: those of this machine).")
 def run(
@@ -80,7 +80,7 @@ def run(
 
 
 def _overrides(quick: bool, seeds: int | None, steps: int | None, settings: tuple[str, ...]) -> dict[str, Any]:
-    """The settings of a study that the options change."""
+    """Return the settings of the study that the options change."""
     overrides: dict[str, Any] = {}
     if quick:
         overrides |= {
@@ -97,7 +97,7 @@ def _overrides(quick: bool, seeds: int | None, steps: int | None, settings: tupl
 @directory_argument
 @json_option
 def show(directory: Path, as_json: bool) -> None:
-    """Print the tables of the run in DIRECTORY again."""
+    """Print the tables of the run in DIRECTORY."""
     from rich.console import Console
 
     from uavmec_jax.runs.results_folder import load_results
@@ -109,8 +109,8 @@ def show(directory: Path, as_json: bool) -> None:
 @click.command()
 @click.argument("run_a", type=click.Path(path_type=Path))
 @click.argument("run_b", type=click.Path(path_type=Path))
-@click.option("--a", "where_a", multiple=True, metavar="NAME=VALUE", help="Agents of A, e.g. --a algorithm=dqn.")
-@click.option("--b", "where_b", multiple=True, metavar="NAME=VALUE", help="Agents of B.")
+@click.option("--a", "where_a", multiple=True, metavar="NAME=VALUE", help="Which agents of A, e.g. --a algorithm=dqn.")
+@click.option("--b", "where_b", multiple=True, metavar="NAME=VALUE", help="Which agents of B.")
 @click.option("--policy-a", default="best", help="Policy of A: best, last, oldest-first, ... (default: best).")
 @click.option("--policy-b", default="best", help="Policy of B (default: best).")
 @json_option
@@ -130,8 +130,8 @@ def compare(
     from uavmec_jax.runs.results_folder import load_results
     from uavmec_jax.studies.compare import Side
 
-    a = Side(load_results(run_a), policy_a, dict(assignment(one, "--a") for one in where_a))
-    b = Side(load_results(run_b), policy_b, dict(assignment(one, "--b") for one in where_b))
+    a = Side(load_results(run_a), policy_a, dict(assignment(text, "--a") for text in where_a))
+    b = Side(load_results(run_b), policy_b, dict(assignment(text, "--b") for text in where_b))
     tables, data = comparison(a, b)
     if as_json:
         print_json({"command": command_line(), **data})

@@ -13,31 +13,31 @@ from uavmec_jax.cli.options import json_option, set_option
 
 @click.group()
 def traffic() -> None:
-    """Evacuations: which devices see the traffic.
+    """Simulate evacuations, and show how much traffic each device sees.
 
     \b
     uavmec traffic show albany                    a place that ships with the package
-    uavmec traffic build --osm town.osm.gz        any town, from an OpenStreetMap extract (needs SUMO)
-    uavmec traffic show town.npz --figure map.png
+    uavmec traffic build --osm area.osm.gz        any place, from an OpenStreetMap extract (needs SUMO)
+    uavmec traffic show area.npz --figure map.png
     """
 
 
 @traffic.command()
 @click.argument("place", required=False)
-@click.option("--osm", type=click.Path(path_type=Path), help="An OpenStreetMap extract: .osm, .osm.gz, .osm.bz2.")
-@click.option("--bbox", metavar="W,S,E,N", help="Part of the extract, in degrees.")
-@click.option("--net", type=click.Path(path_type=Path), help="A SUMO network, .net.xml.")
+@click.option("--osm", type=click.Path(path_type=Path), help="OpenStreetMap extract: .osm, .osm.gz or .osm.bz2.")
+@click.option("--bbox", metavar="W,S,E,N", help="Bounding box to cut from the extract, in degrees.")
+@click.option("--net", type=click.Path(path_type=Path), help="SUMO network, .net.xml.")
 @click.option("--devices", type=click.Path(path_type=Path), help="TOML file with a [[device]] table for each device.")
 @click.option(
-    "--origin", "origins", multiple=True, metavar="ROAD", help="Where people live (default: residential roads)."
+    "--origin", "origins", multiple=True, metavar="ROAD", help="Road where trips start (default: residential roads)."
 )
 @click.option(
-    "--exit", "exits", multiple=True, metavar="NAME[=WEIGHT]", help="Where they leave (default: highway ends)."
+    "--exit", "exits", multiple=True, metavar="NAME[=WEIGHT]", help="Where trips end (default: ends of highways)."
 )
-@click.option("--vehicles", type=int, help="Vehicles that are evacuated.")
-@click.option("--seeds", type=int, help="Simulations that are averaged.")
-@set_option(help="Any setting, e.g. demand.warm_up_s=300.0.")
-@click.option("--out", type=click.Path(path_type=Path), help="File to write (default: <place>.npz).")
+@click.option("--vehicles", type=int, help="Number of vehicles to evacuate.")
+@click.option("--seeds", type=int, help="Number of simulations to average.")
+@set_option(help="Override any setting, e.g. --set demand.warm_up_s=300.0.")
+@click.option("--out", type=click.Path(path_type=Path), help="File of the evacuation (default: <place>.npz).")
 @json_option
 def build(
     place: str | None,
@@ -53,7 +53,7 @@ def build(
     out: Path | None,
     as_json: bool,
 ) -> None:
-    """Simulate the evacuation of PLACE (a TOML file, or one that ships with the package) or of a map or network."""
+    """Simulate the evacuation of PLACE, a TOML file or a place that ships with the package, or of a map or network."""
     if sum(source is not None for source in (place, osm, net)) != 1:
         raise InputError("give one of PLACE, --osm FILE and --net FILE")
     if bbox is not None and osm is None:
@@ -70,7 +70,7 @@ def build(
         source = osm or net
         assert source is not None
         network = {"osm" if osm else "net": str(source.absolute())} | ({"bbox": _box(bbox)} if bbox else {})
-        name = re.sub("[^A-Za-z0-9]+", "-", source.name.split(".")[0]).strip("-") or "town"
+        name = re.sub("[^A-Za-z0-9]+", "-", source.name.split(".")[0]).strip("-") or "place"
         resolved, folder = make_place({"name": name, "network": network} | changes, str(source)), Path()
     target = _target(out or Path(f"{resolved.name}.npz"))
     console = Console(stderr=True)
@@ -85,11 +85,11 @@ def build(
 @click.option("--figure", type=click.Path(path_type=Path), help="Draw the road map (.png, .svg or .pdf).")
 @click.option("--animation", type=click.Path(path_type=Path), help="Draw one evacuation slot by slot (.gif).")
 @click.option(
-    "--policy", default="earliest-deadline", help="AgentIds flies in the animation: a rule, or a policy file."
+    "--policy", default="earliest-deadline", help="Name or file of the policy to animate (default: earliest-deadline)."
 )
-@click.option("--powered", type=int, default=8, help="Devices with grid power in the animation (default: 8).")
-@click.option("--connected", type=int, default=6, help="Devices with communication in the animation (default: 6).")
-@click.option("--seed", type=int, default=0, help="Of hardware, power, communication and task volumes.")
+@click.option("--powered", type=int, default=8, help="Number of devices with grid power to animate (default: 8).")
+@click.option("--connected", type=int, default=6, help="Number of devices with communication to animate (default: 6).")
+@click.option("--seed", type=int, default=0, help="Seed of hardware, power, communication and task volumes.")
 @json_option
 def show(
     source: str,
@@ -101,7 +101,7 @@ def show(
     seed: int,
     as_json: bool,
 ) -> None:
-    """Show SOURCE, an evacuation's file or a place that ships with the package: its devices and their traffic."""
+    """Show the devices and their traffic in SOURCE, the file of an evacuation or a place that ships with the package."""
     from uavmec_jax.traffic.evacuation import load_evacuation
 
     evacuation = load_evacuation(source)
@@ -131,7 +131,7 @@ def show(
 
 
 def _print(evacuation: Any, source: str, as_json: bool) -> None:
-    """The devices as a table, or as JSON."""
+    """Print the devices of an evacuation as a table or as JSON."""
     from rich.console import Console
 
     from uavmec_jax.reporting.evacuation import evacuation_data, evacuation_lines, evacuation_table
@@ -156,14 +156,15 @@ def _changes(
     vehicles: int | None,
     seeds: int | None,
 ) -> dict[str, Any]:
-    """What the options change about a place, as tables of its file."""
+    """Return the changes that the options make to a place, as tables of its file."""
     from uavmec_jax.errors import TrafficError
     from uavmec_jax.files.reading import parse_toml, read_text
 
     demand = {"origins": origins or None, "exits": dict(map(_exit, exits)) or None, "vehicles": vehicles}
-    given: dict[str, dict[str, Any]] = {"demand": demand, "simulation": {"seeds": seeds}}
+    tables: dict[str, dict[str, Any]] = {"demand": demand, "simulation": {"seeds": seeds}}
     changes: dict[str, Any] = {
-        table: {name: value for name, value in own.items() if value is not None} for table, own in given.items()
+        table: {name: value for name, value in options.items() if value is not None}
+        for table, options in tables.items()
     }
     for dotted, value in map(assignment, settings):
         table, _, name = dotted.partition(".")
@@ -178,17 +179,18 @@ def _changes(
 
 
 def _exit(text: str) -> tuple[str, Any]:
-    """``NAME`` or ``NAME=WEIGHT``."""
+    """Parse ``NAME`` or ``NAME=WEIGHT``."""
     name, equals, weight = text.rpartition("=")
     if not equals:
         return text, 1.0
     try:
         return name, float(weight)
     except ValueError:
-        raise InputError(f"--exit {text}: the weight is {weight!r}; give NAME=WEIGHT with a number above 0")
+        raise InputError(f"--exit {text}: the weight is {weight!r}; give NAME=WEIGHT with a number above 0") from None
 
 
 def _box(text: str) -> tuple[float, ...]:
+    """Parse the bounding box ``W,S,E,N``."""
     try:
         sides = tuple(float(side) for side in text.split(","))
     except ValueError:
@@ -199,7 +201,7 @@ def _box(text: str) -> tuple[float, ...]:
 
 
 def _target(path: Path) -> Path:
-    """A file that can be written, known before anything is simulated."""
+    """Check, before anything is simulated, that the file can be written."""
     if path.suffix != ".npz":
         raise InputError(f"--out {path}: ends in {path.suffix!r}; it should end in .npz")
     if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):

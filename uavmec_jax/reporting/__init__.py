@@ -1,1 +1,1 @@
-"""Tables and figures, from results alone."""
+"""Tables, figures, maps and files that people read, made from results alone."""

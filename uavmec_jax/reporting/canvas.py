@@ -1,4 +1,4 @@
-"""Figures without a display, written atomic or not at all."""
+"""Figures without a display, written atomically."""
 
 from pathlib import Path
 
@@ -9,13 +9,13 @@ from uavmec_jax.files.writing import atomic
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure, atomic or not at all; the ending says the format."""
+    """Write a figure atomically; the ending of the path is its format."""
     with atomic(path) as partial:
         figure.savefig(partial, dpi=144, metadata={"Software": None} if path.suffix == ".png" else None)
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure that needs no display."""
+    """Make an empty figure that needs no display; sides in inches."""
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure

@@ -1,4 +1,4 @@
-"""Tables of comparisons: two runs, and one policy beside others on one scenario."""
+"""Tables of comparisons: of two runs, and of one policy with others on one scenario."""
 
 import json
 from typing import Any
@@ -19,31 +19,33 @@ _MEASURES = {
 
 
 def comparison(a: Side, b: Side) -> tuple[dict[str, Table], dict[str, Any]]:
-    """Tables by title, and the same as plain data.
+    """Compare two runs; return tables by title, and the same as plain data.
 
     Raises:
         StudyError: the runs have nothing to compare.
     """
-    both, axes = pair(a, b)
-    cells, atomic = differences(both, axes), overall(both, axes)
-    titles = {
-        f"Lifetime in slots, seed by seed. A: {a.name}; B: {b.name}": _cells(cells, axes),
-        f"Over all {len(cells)} cells, {len(both)} pairs": _whole(atomic),
+    pairs, axes = pair(a, b)
+    cells, measures = differences(pairs, axes), overall(pairs, axes)
+    tables = {
+        f"Lifetime in slots, seed by seed. A: {a.name}; B: {b.name}": _cell_table(cells, axes),
+        f"Over all {len(cells)} cells, {len(pairs)} pairs": _measure_table(measures),
     }
     data = {
         "a": a.name,
         "b": b.name,
-        "pairs": len(both),
+        "pairs": len(pairs),
         "cells": json.loads(cells.to_json(orient="records")),
-        "overall": {name: dict(zip(("value", "low", "high"), one, strict=True)) for name, one in atomic.items()},
+        "overall": {
+            name: dict(zip(("value", "low", "high"), values, strict=True)) for name, values in measures.items()
+        },
     }
-    return titles, data
+    return tables, data
 
 
-def _cells(cells: pd.DataFrame, axes: list[str]) -> Table:
+def _cell_table(cells: pd.DataFrame, axes: list[str]) -> Table:
     table = Table()
-    for name in (*axes, "seeds", "A", "B", "B - A"):
-        table.add_column(name, justify="right")
+    for column in (*axes, "seeds", "A", "B", "B - A"):
+        table.add_column(column, justify="right")
     for _, cell in cells.iterrows():
         style = "green" if cell["low"] > 0 else "red" if cell["high"] < 0 else "default"
         difference = Text(f"{cell['difference']:+.2f}", style=style)
@@ -52,21 +54,26 @@ def _cells(cells: pd.DataFrame, axes: list[str]) -> Table:
     return table
 
 
-def _whole(atomic: dict[str, tuple[float, float, float]]) -> Table:
+def _measure_table(measures: dict[str, tuple[float, float, float]]) -> Table:
     table = Table()
-    for name, justify in (("measure", "left"), ("value", "right"), ("95 %", "right")):
-        table.add_column(name, justify=justify)  # type: ignore[arg-type]
-    for name, words in _MEASURES.items():
-        value, low, high = atomic[name]
-        table.add_row(words, f"{value:.3f}", f"{low:.3f} to {high:.3f}" if low == low else "-")
+    table.add_column("measure")
+    for column in ("value", "95 %"):
+        table.add_column(column, justify="right")
+    for name, description in _MEASURES.items():
+        value, low, high = measures[name]
+        table.add_row(description, f"{value:.3f}", f"{low:.3f} to {high:.3f}" if low == low else "-")
     return table
 
 
 def evaluation_table(rows: list[dict[str, Any]]) -> Table:
-    """One line per policy on one scenario, from :func:`uavmec_jax.scenarios.load.evaluate`."""
+    """Return a table with one row per policy on one scenario.
+
+    Args:
+        rows: from :func:`uavmec_jax.studies.policy_evaluation.evaluate_policy`.
+    """
     table = Table()
-    for name in ("policy", "lifetime, slots", "shortest", "longest", "ends by", "first to fail"):
-        table.add_column(name, justify="left" if name == "policy" else "right")
+    for column in ("policy", "lifetime, slots", "shortest", "longest", "ends by", "first to fail"):
+        table.add_column(column, justify="left" if column == "policy" else "right")
     for row in rows:
         mean = Text(f"{row['mean']:.2f}").append(half_interval(row["low"], row["high"]), style="dim")
         device = first_to_fail(row["first_device"]) + f" {row['first_share']:.0%}" * bool(row["first_device"])

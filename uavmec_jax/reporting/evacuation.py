@@ -1,4 +1,4 @@
-"""What devices see of an evacuation, as a table, as lines and as data."""
+"""A simulated evacuation as a table, as lines of text and as plain data."""
 
 from typing import Any
 
@@ -8,19 +8,18 @@ from uavmec_jax.traffic.evacuation import HIGH_TRAFFIC, Evacuation
 
 
 def evacuation_table(evacuation: Evacuation) -> Table:
-    """One line per device; those in high traffic are bold."""
+    """Return a table with one row per device; devices in high traffic are bold."""
     table = Table()
-    for name in ("#", "device"):
-        table.add_column(name, justify="right" if name == "#" else "left")
-    for name in ("m east", "m north", "vehicles/km/lane", "± seeds", "weight"):
-        table.add_column(name, justify="right")
+    for column in ("#", "device", "m east", "m north", "vehicles/km/lane", "± seeds", "weight"):
+        table.add_column(column, justify="left" if column == "device" else "right")
     position = evacuation.local_position()
     for k, name in enumerate(evacuation.meta["names"]):
-        numbers = (f"{position[k, 0]:.0f}", f"{position[k, 1]:.0f}", f"{evacuation.density[k]:.1f}")
         table.add_row(
             str(k + 1),
             name,
-            *numbers,
+            f"{position[k, 0]:.0f}",
+            f"{position[k, 1]:.0f}",
+            f"{evacuation.density[k]:.1f}",
             f"{evacuation.density_spread[k]:.1f}",
             f"{evacuation.weight[k]:.2f}",
             style="bold" if evacuation.busy[k] else None,
@@ -29,7 +28,7 @@ def evacuation_table(evacuation: Evacuation) -> Table:
 
 
 def evacuation_lines(evacuation: Evacuation) -> list[str]:
-    """How it was simulated, and what to know about that."""
+    """Return the lines below the table: how the evacuation was simulated, and warnings."""
     meta = evacuation.meta
     first, last = (seconds / 60 for seconds in meta["mean_s"])
     loaded, unfinished, teleports = (sum(meta[name]) for name in ("loaded", "unfinished", "teleports"))
@@ -41,12 +40,12 @@ def evacuation_lines(evacuation: Evacuation) -> list[str]:
         f"{teleports:,} were stuck and moved on. The devices span {width:,.0f} x {height:,.0f} m. SUMO {meta['sumo']}.",
     ]
     if meta["cut_off"]:
-        lines.append(f"{meta['cut_off']} residential roads have no way to any exit; nobody leaves from there.")
+        lines.append(f"{meta['cut_off']} residential roads have no way to any exit; no vehicle leaves from there.")
     return lines + [f"Warning: {line}." for line in meta["warnings"]]
 
 
 def evacuation_data(evacuation: Evacuation) -> dict[str, Any]:
-    """The same for programs."""
+    """Return the evacuation as plain data, without the roads; ``uavmec traffic show --json`` prints it."""
     position = evacuation.local_position()
     meta = {name: value for name, value in evacuation.meta.items() if name not in ("roads", "names")}
     devices = [

@@ -9,10 +9,14 @@ from uavmec_jax.scenarios.named_scenario import NamedScenario
 
 
 def tour_geojson(scenario: NamedScenario, plan: Plan) -> dict[str, Any]:
-    """A feature collection; longitude and latitude in degrees.
+    """Return a feature collection; coordinates are longitude and latitude in degrees.
+
+    Args:
+        scenario: what was planned for.
+        plan: its tours, slot by slot.
 
     Raises:
-        ScenarioError: the scenario has no place on the map.
+        ScenarioError: the scenario has no geographic position.
     """
     devices = scenario.geographic(np.asarray(plan.layout.position))
     visits = {name: np.bincount(tour.action, minlength=len(devices)) for name, tour in plan.tours.items()}
@@ -37,11 +41,14 @@ def tour_geojson(scenario: NamedScenario, plan: Plan) -> dict[str, Any]:
         moved = np.append(True, np.any(np.diff(stops, axis=0) != 0, axis=1))
         path = scenario.geographic(stops[moved]).tolist()
         path = path if len(path) > 1 else path * 2  # a line has at least two positions
-        lifetime = float(plan.lifetimes[name].mean())
-        properties = {"tour": name, "devices": [int(a) + 1 for a in tour.action], "mean_lifetime_slots": lifetime}
+        properties = {
+            "tour": name,
+            "devices": [int(action) + 1 for action in tour.action],
+            "mean_lifetime_slots": float(plan.lifetimes[name].mean()),
+        }
         lines.append(_feature("LineString", path, properties))
     return {"type": "FeatureCollection", "features": [*points, *lines]}
 
 
-def _feature(kind: str, coordinates: list, properties: dict[str, Any]) -> dict[str, Any]:
-    return {"type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": properties}
+def _feature(geometry: str, coordinates: list, properties: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "Feature", "geometry": {"type": geometry, "coordinates": coordinates}, "properties": properties}

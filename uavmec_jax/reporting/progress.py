@@ -4,16 +4,17 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from rich import progress as rich_progress
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from uavmec_jax.runs.run_plan import RunPlan
-from uavmec_jax.training.population import Progress as SearchProgress
+from uavmec_jax.training.population import Progress
 
 
 @contextmanager
-def progress_bar(console: Console, plan: RunPlan) -> Iterator[Callable[[SearchProgress], None]]:
-    """Show steps/s, mean episode length and time left; yields what the run reports to."""
+def progress_bar(console: Console, plan: RunPlan) -> Iterator[Callable[[Progress], None]]:
+    """Show speed, mean episode length and time left; yield the function that the run reports its progress to."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -24,18 +25,18 @@ def progress_bar(console: Console, plan: RunPlan) -> Iterator[Callable[[SearchPr
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console) as bar:
+    with rich_progress.Progress(*columns, console=console) as bar:
         unit = "steps" if plan.total_steps else "scenarios"
         task = bar.add_task("compiling", total=plan.work, speed="-", length="-", unit=unit)
 
-        def report(news: SearchProgress) -> None:
-            speed = bar.tasks[task].speed
+        def report(progress: Progress) -> None:
+            speed, length = bar.tasks[task].speed, progress.mean_episode_length
             bar.update(
                 task,
-                completed=news.steps,
-                description=f"shard {news.shard + 1}/{len(plan.shards)}",
+                completed=progress.steps,
+                description=f"shard {progress.shard + 1}/{len(plan.shards)}",
                 speed=f"{speed:,.0f}" if speed else "-",
-                length="-" if math.isnan(news.mean_episode_length) else f"{news.mean_episode_length:.1f}",
+                length="-" if math.isnan(length) else f"{length:.1f}",
             )
 
         yield report

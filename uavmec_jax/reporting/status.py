@@ -1,15 +1,15 @@
-"""A run's status in words."""
+"""The status of a run as lines of text."""
 
 import datetime
 
 from uavmec_jax.runs.status import Status
 
-_MOST = 8
-"""Workers and failures that are named."""
+_MAX_LINES = 8
+"""Workers and failures that are listed."""
 
 
 def status_lines(status: Status) -> list[str]:
-    """What stands in ``uavmec status``."""
+    """Return the lines that ``uavmec status`` prints."""
     states = ", ".join(f"{count:,} {state}" for state, count in status.shards.items() if count)
     share = status.steps / max(status.total_steps, 1)
     lines = [
@@ -21,12 +21,13 @@ def status_lines(status: Status) -> list[str]:
     if status.seconds_left is not None:
         left = datetime.timedelta(seconds=round(status.seconds_left))
         lines.append(f"speed: {status.steps_per_second:,.0f} steps/s, training left: {left}")
-    lines += _first(status.workers)
-    lines += _first([f"shard {number} failed: {why}" for number, why in status.failures.items()])
+    lines += _truncate(status.workers)
+    lines += _truncate([f"shard {number} failed: {why}" for number, why in status.failures.items()])
     if not status.complete and not status.workers:
         lines.append(f"nobody is at work; go on with: uavmec resume {status.directory}")
     return lines
 
 
-def _first(lines: list[str]) -> list[str]:
-    return lines[:_MOST] + [f"... and {len(lines) - _MOST} more"] * (len(lines) > _MOST)
+def _truncate(lines: list[str]) -> list[str]:
+    """Return the first lines, and how many more there are."""
+    return lines[:_MAX_LINES] + [f"... and {len(lines) - _MAX_LINES} more"] * (len(lines) > _MAX_LINES)

@@ -1,4 +1,4 @@
-"""Rewards against algorithms: the paper's Table 6 and studies like it."""
+"""Rewards by algorithms: the paper's Table 6 and studies like it."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -7,20 +7,20 @@ import pandas as pd
 from rich.table import Table
 from rich.text import Text
 
-from uavmec_jax.reporting.formatting import half_interval
+from uavmec_jax.reporting.formatting import column_name, half_interval
 from uavmec_jax.studies.paper import TABLE6
 from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.schema import PLANNERS
 
 
 def is_table6(results: Results) -> bool:
-    """Whether a study holds rewards against algorithms and nothing else."""
+    """Return whether the axes of a study are rewards and algorithms and nothing else."""
     axes = set(results.study.axes) - {"powered", "connected", "cells", "seeds", "guard"}
     return axes == {"algorithm", "reward"}
 
 
 def label_rewards(cells: pd.DataFrame) -> list[str]:
-    """Name of each cell's reward; those that stand there under a second guard name it."""
+    """Return the reward of each cell, with its guard where that is not the first one of the study."""
     if "guard" not in cells:
         return [str(reward) for reward in cells["reward"]]
     first = cells["guard"].iloc[0]
@@ -29,34 +29,37 @@ def label_rewards(cells: pd.DataFrame) -> list[str]:
 
 
 def table6_tables(cells: pd.DataFrame) -> dict[str, Table]:
-    """The paper's table, one for each of its columns of cells, and those who learn nothing."""
+    """Return tables by title: one for each pair of counts of powered and connected devices, and one without training."""
     guard = f"; logarithms guarded by {cells['guard'].iloc[0]} where nothing else is said" if "guard" in cells else ""
-    how = f"best weights: mean over the seeds ± 95 %; maximum / the paper's maximum; last weights{guard}"
-    places = dict.fromkeys(zip(cells.powered, cells.connected, strict=True))
-    return {
-        f"{powered} powered, {connected} connected: lifetime in slots, {how}": table6_table(
+    content = f"best weights: mean over the seeds ± 95 %; maximum / the paper's maximum; last weights{guard}"
+    pairs = dict.fromkeys(zip(cells.powered, cells.connected, strict=True))
+    tables = {
+        f"{powered} powered, {connected} connected: lifetime in slots, {content}": table6_table(
             cells[(cells.powered == powered) & (cells.connected == connected)]
         )
-        for powered, connected in places
-    } | {"Lifetime in slots of those who learn nothing, on the same layouts": _others(cells)}
+        for powered, connected in pairs
+    }
+    return tables | {"Lifetime in slots without training, on the same layouts": _untrained_table(cells)}
 
 
 def table6_table(cells: pd.DataFrame) -> Table:
-    """One place of Table 6: rewards down, algorithms across. The best mean of each algorithm is bold."""
-    cells = cells.assign(reward_shown=label_rewards(cells))
+    """Return one column of Table 6 as a table: rewards down, algorithms across; the best mean per algorithm is bold."""
+    cells = cells.assign(label=label_rewards(cells))
     algorithms = list(dict.fromkeys(cells["algorithm"]))
     table = Table()
     table.add_column("reward")
     for algorithm in algorithms:
         table.add_column(algorithm.upper(), justify="right", no_wrap=True)
-    keyed: Any = cells.set_index(["algorithm", "reward_shown"], drop=False)
-    highest = {algorithm: keyed.loc[algorithm]["best"].max() for algorithm in algorithms}
-    for shown in dict.fromkeys(cells["reward_shown"]):
+    indexed: Any = cells.set_index(["algorithm", "label"], drop=False)
+    highest = {algorithm: indexed.loc[algorithm]["best"].max() for algorithm in algorithms}
+    for label in dict.fromkeys(cells["label"]):
         entries = [
-            _entry(keyed.loc[(algorithm, shown)], highest[algorithm]) if (algorithm, shown) in keyed.index else Text("")
-            for algorithm in algorithms  # an interrupted run has holes
+            _entry(indexed.loc[(algorithm, label)], highest[algorithm])
+            if (algorithm, label) in indexed.index
+            else Text("")  # not there yet: the run was interrupted
+            for algorithm in algorithms
         ]
-        table.add_row(shown, *entries)
+        table.add_row(label, *entries)
     return table
 
 
@@ -70,18 +73,18 @@ def _entry(cell: Any, highest: float) -> Text:
     return text.append(half_interval(cell["last_low"], cell["last_high"]), style="dim not bold")
 
 
-def _others(cells: pd.DataFrame) -> Table:
-    """Heuristics, planners and bound: the same for every reward and algorithm."""
-    names = list(_untrained(cells))
+def _untrained_table(cells: pd.DataFrame) -> Table:
+    """Lifetimes of heuristics, planners and bound, which are the same for every reward and algorithm."""
+    policies = list(_untrained_policies(cells))
     table = Table()
-    for name in ("powered / connected", *names):
-        table.add_column(name.removesuffix("_planned").replace("_", "-"), justify="right")
+    for column in ("powered / connected", *policies):
+        table.add_column(column_name(column.removesuffix("_planned")), justify="right")
     for (powered, connected), group in cells.groupby(["powered", "connected"], sort=False):
-        table.add_row(f"{powered} / {connected}", *(f"{group[name].iloc[0]:.1f}" for name in names))
+        table.add_row(f"{powered} / {connected}", *(f"{group[policy].iloc[0]:.1f}" for policy in policies))
     return table
 
 
-def _untrained(cells: pd.DataFrame) -> Iterator[str]:
+def _untrained_policies(cells: pd.DataFrame) -> Iterator[str]:
     for name in map(str, cells):
         heuristic = f"{name}_fixed" in cells and name not in ("best", "last")
         if heuristic or name.removesuffix("_planned") in PLANNERS:

@@ -1,4 +1,4 @@
-"""The figure of a study of places: each road map, and beside it who failed first."""
+"""The figure of a study of places: each road map, and beside it the first failures of its devices."""
 
 import numpy as np
 import pandas as pd
@@ -8,19 +8,19 @@ from matplotlib.figure import Figure
 from uavmec_jax.errors import TrafficError
 from uavmec_jax.reporting.canvas import new_figure
 from uavmec_jax.reporting.road_map import draw_map
-from uavmec_jax.reporting.table7 import columns_of
+from uavmec_jax.reporting.table7 import count_columns
 from uavmec_jax.studies.first_failures import first_failure_groups
 from uavmec_jax.studies.paper import TABLE7
 from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.schema import PLANNERS
 from uavmec_jax.traffic.evacuation import load_evacuation
 
-_MOST_ROWS = 8
+_MAX_ROWS = 8
 
 
 def table7_figure(results: Results) -> Figure:
-    """A row for each place (and cell): its map, if its file is still there, and the first failures of its devices."""
-    groups = dict(list(first_failure_groups(results).items())[:_MOST_ROWS])
+    """Return a row for each place (and cell): its map, if its file still exists, and its first failures."""
+    groups = dict(list(first_failure_groups(results).items())[:_MAX_ROWS])
     figure = new_figure(14, 5.4 * len(groups))
     axes = figure.subplots(len(groups), 2, squeeze=False, width_ratios=(1, 1.3))
     for (left, right), (name, counts) in zip(axes, groups.items(), strict=True):
@@ -29,25 +29,25 @@ def table7_figure(results: Results) -> Figure:
         except TrafficError as error:
             left.text(0.5, 0.5, f"no map: {error}", ha="center", va="center", wrap=True, fontsize=8)
             left.set_axis_off()
-        draw_bars(right, counts, name)
+        _draw_failures(right, counts, name)
     seeds = results.agents["seed"].nunique()
     figure.suptitle(f"{results.study.name}: {seeds} scenarios, {results.study.steps:,} steps", fontsize=11)
     return figure
 
 
-def draw_bars(axis: Axes, counts: pd.DataFrame, name: str) -> None:
-    """First failures of the devices of one group, a bar for each way to play; devices in high traffic are shaded."""
-    shown = counts[~counts["policy"].isin(PLANNERS)]  # the table has them; more bars than these cannot be told apart
-    columns = {name: own["count"].to_numpy() for name, own in columns_of(shown).items()}
+def _draw_failures(axis: Axes, counts: pd.DataFrame, name: str) -> None:
+    """Draw the first failures of each device, one bar per policy; devices in high traffic are shaded."""
+    drawn = counts[~counts["policy"].isin(PLANNERS)]  # with the planners, the bars would be too thin to tell apart
+    columns = {policy: rows["count"].to_numpy() for policy, rows in count_columns(drawn).items()}
     place = str(counts["place"].iloc[0])
     if place in TABLE7:
         columns["paper"] = np.array(TABLE7[place], float)
     devices = counts.drop_duplicates("device")
     numbers = devices["device"].to_numpy()
     width = 0.8 / len(columns)
-    for k, (traffic, values) in enumerate(columns.items()):
-        colour = "black" if traffic == "paper" else None
-        axis.bar(numbers + (k - (len(columns) - 1) / 2) * width, values, width, label=traffic, color=colour)
+    for k, (policy, values) in enumerate(columns.items()):
+        colour = "black" if policy == "paper" else None
+        axis.bar(numbers + (k - (len(columns) - 1) / 2) * width, values, width, label=policy, color=colour)
     for number in numbers[devices["high_traffic"].to_numpy()]:
         axis.axvspan(number - 0.5, number + 0.5, color="lightgrey", alpha=0.5, zorder=0, lw=0)
     axis.set_xticks(numbers)
@@ -55,4 +55,4 @@ def draw_bars(axis: Axes, counts: pd.DataFrame, name: str) -> None:
     axis.set_xlabel("device; shaded: in high traffic")
     axis.set_ylabel("first failures")
     axis.legend(fontsize=7)
-    axis.set_title(f"{name}: who fails first", fontsize=10)
+    axis.set_title(f"{name}: first failures", fontsize=10)

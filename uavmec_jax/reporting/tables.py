@@ -1,12 +1,13 @@
-"""Tables for the terminal, from results alone."""
+"""Tables of runs for the terminal, from results alone."""
 
+from collections.abc import Callable
 from typing import Any
 
 import pandas as pd
 from rich.table import Table
 from rich.text import Text
 
-from uavmec_jax.reporting.formatting import axis_values, first_to_fail, half_interval
+from uavmec_jax.reporting.formatting import axis_values, column_name, first_to_fail, half_interval
 from uavmec_jax.reporting.table6 import is_table6, table6_tables
 from uavmec_jax.reporting.table7 import table7_tables
 from uavmec_jax.studies.first_failures import has_places
@@ -14,17 +15,17 @@ from uavmec_jax.studies.paper import TABLE5
 from uavmec_jax.studies.population import cell_axes
 from uavmec_jax.studies.results import Results
 
-NOTICEABLE_SLOTS = 0.5
-"""Differences from the paper below this many slots are not coloured: the paper rounds, and averages few seeds."""
+_NOTICEABLE_SLOTS = 0.5
+"""Differences from the paper below this are not coloured: the paper rounds its numbers and averages few seeds."""
 
 
 def is_grid(results: Results) -> bool:
-    """Whether the cells of a study are power x comms and nothing else."""
+    """Return whether the axes of a study are powered and connected devices and nothing else."""
     return cell_axes(results.study) == ["powered", "connected"]
 
 
 def tables(results: Results) -> dict[str, Table]:
-    """The tables of a run by title: Tables 5 to 7 where the study is like theirs, else a list of cells."""
+    """Return the tables of a run by title: like Tables 5 to 7 where the study is like theirs, else a list of cells."""
     cells = results.cells()
     if has_places(results):
         return table7_tables(results)
@@ -32,6 +33,11 @@ def tables(results: Results) -> dict[str, Table]:
         return table6_tables(cells)
     if not is_grid(results):
         return {"Lifetime in slots, mean over the seeds ± 95 %": list_table(results, cells)}
+    return _grid_tables(results, cells)
+
+
+def _grid_tables(results: Results, cells: pd.DataFrame) -> dict[str, Table]:
+    """The tables of a study like Table 5."""
     trained = [name for name in ("best", "last") if name in results.policies]
     below = f"below: paper{' / oldest-first' * ('oldest_first' in results.policies)}"
     titles: dict[str, str] = {name: f"Lifetime in slots, `{name}` weights ± 95 %; {below}" for name in trained}
@@ -47,7 +53,7 @@ def tables(results: Results) -> dict[str, Table]:
 
 
 def display_name(policy: str) -> str:
-    """A policy's name as people write it."""
+    """Return the name of a policy, as in the columns of results, in plain words."""
     names = {
         "best": "best weights",
         "last": "last weights",
@@ -55,22 +61,22 @@ def display_name(policy: str) -> str:
         "beam": "clairvoyant beam",
         "bound": "upper bound",
     }
-    return names.get(policy, policy.replace("_", "-"))
+    return names.get(policy, column_name(policy))
 
 
 def gap_title(results: Results) -> str:
-    """What the lines of a cell of :func:`gap_table` say."""
+    """Return the title of :func:`gap_table`: it names the lines of a cell."""
     steps = "; ".join(_step(upper, lower) for upper, lower in results.gaps)
-    return f"How far from the best possible, % (same layouts and volumes): {steps}"
+    return f"Gaps up to the upper bound, % (same layouts and volumes): {steps}"
 
 
 def gap_table(results: Results, cells: pd.DataFrame) -> Table:
-    """The steps from the shown policy up to the bound, each in percent of the lower one."""
+    """Return a grid of the steps from the shown policy up to the bound, each in percent of the lower lifetime."""
     return _grid(cells, lambda cell: Text("\n".join(f"{gap:+.1f}" for gap in gap_percent(results, cell).values())))
 
 
 def gap_percent(results: Results, cell: Any) -> dict[str, float]:
-    """Per step, e.g. ``beam_over_rollout``, how many percent the upper mean is above the lower one."""
+    """Return by how many percent each step raises the mean lifetime; a step is named like ``beam_over_rollout``."""
     return {
         f"{upper}_over_{lower}": 100 * (cell[f"{upper}_planned"] / cell[f"{lower}_planned"] - 1)
         for upper, lower in results.gaps
@@ -78,7 +84,7 @@ def gap_percent(results: Results, cell: Any) -> dict[str, float]:
 
 
 def grid_table(results: Results, cells: pd.DataFrame, policy: str) -> Table:
-    """Lifetimes in slots: ours +- half the 95 % interval, below it the paper's / oldest-first's."""
+    """Return a grid of lifetimes in slots: ours ± half the 95 % interval; below, the paper's / oldest-first's."""
     baseline = "oldest_first" if "oldest_first" in results.policies else None
     return _grid(cells, lambda cell: _lifetime(cell, policy, baseline))
 
@@ -94,13 +100,13 @@ def _lifetime(cell: Any, policy: str, baseline: str | None) -> Text:
 
 
 def _style(ours: float, paper: float | None) -> str:
-    if paper is None or abs(ours - paper) < NOTICEABLE_SLOTS:
+    if paper is None or abs(ours - paper) < _NOTICEABLE_SLOTS:
         return "bold"
     return "bold green" if ours > paper else "bold red"
 
 
 def paired_table(cells: pd.DataFrame) -> Table:
-    """Paired differences to oldest-first; coloured where the interval leaves out zero."""
+    """Return a grid of paired differences from oldest-first, coloured where the interval does not contain zero."""
 
     def difference(cell: Any, policy: str) -> Text:
         mean, low, high = (cell[f"{policy}_over_oldest{part}"] for part in ("", "_low", "_high"))
@@ -111,7 +117,7 @@ def paired_table(cells: pd.DataFrame) -> Table:
 
 
 def failure_table(cells: pd.DataFrame, policy: str = "best") -> Table:
-    """The device that fails first most often under a policy, and in what share of the episodes."""
+    """Return a grid of the device that fails first most often under a policy, and its share of the episodes."""
 
     def first(cell: Any) -> Text:
         device = cell[f"{policy}_first_device"]
@@ -121,7 +127,8 @@ def failure_table(cells: pd.DataFrame, policy: str = "best") -> Table:
     return _grid(cells, first)
 
 
-def _grid(cells: pd.DataFrame, content: Any) -> Table:
+def _grid(cells: pd.DataFrame, content: Callable[[Any], Text]) -> Table:
+    """A table of powered x connected devices with a text for each cell; empty where an interrupted run has none."""
     table = Table()
     connected = list(dict.fromkeys(cells["connected"]))
     table.add_column("power\n\\ comms", justify="right", style="bold")
@@ -135,16 +142,16 @@ def _grid(cells: pd.DataFrame, content: Any) -> Table:
 
 
 def list_table(results: Results, cells: pd.DataFrame) -> Table:
-    """One line per cell: every policy's mean lifetime, the interval for the learned ones."""
+    """Return a table with one row per cell: every policy's mean lifetime, with an interval if it was trained."""
     axes = cell_axes(results.study)
     table = Table()
     for name in (*axes, "seeds"):
         table.add_column(name, justify="right")
     for policy in results.policies:
-        table.add_column(policy.replace("_", "-"), justify="right")
+        table.add_column(column_name(policy), justify="right")
     for upper, lower in results.gaps:
-        table.add_column(f"{lower.replace('_', '-')} to {upper}, %", justify="right")
-    drawn = results.study.scenarios is not None  # every draw is another town: numbers of devices mean nothing
+        table.add_column(f"{column_name(lower)} to {upper}, %", justify="right")
+    drawn = results.study.scenarios is not None  # every draw is another scenario: device numbers mean nothing
     if not drawn:
         table.add_column("first to fail", justify="right")
     for _, cell in cells.iterrows():
@@ -165,9 +172,9 @@ def _step(upper: str, lower: str) -> str:
 
 
 def summary(results: Results) -> list[str]:
-    """A few lines below the tables: overall means and what the run cost."""
+    """Return the lines below the tables: overall means, gaps, and what the run cost."""
     cells, run = results.cells(), results.run
-    means = ", ".join(f"{name.replace('_', '-')} {cells[name].mean():.2f}" for name in results.policies)
+    means = ", ".join(f"{column_name(name)} {cells[name].mean():.2f}" for name in results.policies)
     lines = [f"Mean over {len(cells)} cells, slots: {means}."]
     if results.gaps:
         draws = results.evaluation[f"{results.gaps[0][0]}/lifetime"].shape[1]

@@ -1,4 +1,4 @@
-"""Runs: a study carried out, with a plan, checkpoints and a status, by one process or several."""
+"""Runs: carry out a study, in one process or several, with a run plan, checkpoints and a status."""
 
 import lazy_loader
 

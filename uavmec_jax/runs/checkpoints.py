@@ -1,4 +1,4 @@
-"""Checkpoints of a shard in training: the whole state, checked, with the previous one kept."""
+"""Checkpoints of a shard in training: its whole state in a checked file; the previous checkpoint is kept too."""
 
 import time
 from collections.abc import Callable
@@ -13,17 +13,24 @@ from uavmec_jax.scenarios.policy_files import PolicyCollection, write_policies
 from uavmec_jax.training.training import Training
 
 SCHEMA = 1
-"""Version of a checkpoint's file."""
+"""Version of the checkpoint file."""
 
 _BYTES_PER_SECOND = 150e6
-"""Assumed speed of writing the first one."""
+"""Assumed speed of writing, until a checkpoint has been timed."""
 
 _KEPT = 2
-"""Generations."""
+"""Checkpoints of a shard that are kept."""
 
 
 def interval_s(every_s: float, share: float, size: float, cost_s: float | None = None) -> float:
-    """Return the seconds between two checkpoints of ``size`` bytes; ``cost_s`` is the measured time of writing one."""
+    """Return the seconds between two checkpoints.
+
+    Args:
+        every_s: the least.
+        share: largest share of the time that writing may take.
+        size: bytes of a checkpoint.
+        cost_s: measured seconds of writing one; ``None`` before the first.
+    """
     return max(every_s, (size / _BYTES_PER_SECOND if cost_s is None else cost_s) / share)
 
 
@@ -32,14 +39,14 @@ class Checkpoints:
     """The checkpoints of one shard.
 
     Attributes:
-        folder: of the shard.
-        kind: what is saved.
-        every_s: least time between two, by the monotonic clock.
-        share: largest share of the time that they may take.
+        folder: the shard's folder.
+        kind: what a checkpoint holds.
+        every_s: least seconds between two, by the monotonic clock.
+        share: largest share of the time that writing may take.
         bytes: approximate size of one.
-        identity: the run and the shard that a checkpoint must be of.
+        identity: the run and the shard, which a checkpoint must name to be restored.
         log_event: called with ``(event, **facts)``.
-        collect: makes the policies of a ``weights`` checkpoint.
+        collect: turns weights into the policies that a ``weights`` checkpoint holds.
     """
 
     folder: Path
@@ -55,16 +62,16 @@ class Checkpoints:
 
     @property
     def is_due(self) -> bool:
-        """Whether the interval is over and writing one takes a small share of the time since the last one."""
+        """Whether enough time has passed since the last one."""
         return time.monotonic() - self._last >= interval_s(self.every_s, self.share, self.bytes, self._cost_s)
 
     def write(self, training: Training) -> None:
-        """Save a training between two chunks, whole or not at all; older generations are removed afterwards.
+        """Save a training between two chunks, atomically, and remove the oldest checkpoints.
 
         Raises:
-            OSError: it cannot be written; the earlier ones are untouched.
+            OSError: the file cannot be written; earlier checkpoints are untouched.
         """
-        tick = time.monotonic()
+        started = time.monotonic()
         path = self._next_path()
         if self.kind == "weights":
             write_policies(path, self.collect(training.weights(self.identity["agents"])))
@@ -74,15 +81,15 @@ class Checkpoints:
         for older in self._generations()[_KEPT:]:
             older.unlink(missing_ok=True)
         self._last = time.monotonic()
-        self._cost_s = self._last - tick
+        self._cost_s = self._last - started
         training.seconds["checkpoint"] = training.seconds.get("checkpoint", 0.0) + self._cost_s
         size = path.stat().st_size
         self.log_event("checkpoint", file=path.name, steps=training.steps, bytes=size, seconds=self._cost_s)
 
     def resume(self, start: Callable[[], Training]) -> Training:
-        """Resume from the newest intact checkpoint, or start anew.
+        """Resume from the newest intact checkpoint; without one, from the start.
 
-        A damaged checkpoint is reported, set aside and skipped.
+        A damaged checkpoint is logged, renamed and skipped.
         """
         training = start()
         for path in self._generations() if self.kind == "full" else ():
@@ -101,13 +108,13 @@ class Checkpoints:
 
     def _restore(self, path: Path, training: Training) -> dict[str, Any]:
         with open_checked(path, SCHEMA, "a checkpoint", StudyError) as (facts, arrays):
-            if strange := [name for name, value in self.identity.items() if facts.get(name) != value]:
-                raise StudyError(f"{path}: is of another run: its {', '.join(strange)} differ")
+            if different := [name for name, value in self.identity.items() if facts.get(name) != value]:
+                raise StudyError(f"{path}: belongs to another run: its {', '.join(different)} differ")
             training.restore(facts["chunks_done"], arrays)
         return facts
 
     def remove(self) -> None:
-        """Remove all of them: the shard is finished."""
+        """Remove all checkpoints, once the shard is finished."""
         for path in [*self._generations(), *self.folder.glob("checkpoint-*.damaged")]:
             path.unlink(missing_ok=True)
 
@@ -116,5 +123,5 @@ class Checkpoints:
         return self.folder / f"checkpoint-{max(numbers, default=0) + 1:06d}.npz"
 
     def _generations(self) -> list[Path]:
-        """The newest first."""
+        """Return the checkpoints, the newest first."""
         return sorted(self.folder.glob("checkpoint-*.npz"), reverse=True)

@@ -1,4 +1,4 @@
-"""Workers on a cluster, started by submitit; what they do is what `uavmec worker` does."""
+"""Start workers on a cluster with submitit; each does what `uavmec worker` does."""
 
 import tempfile
 from collections.abc import Callable, Mapping
@@ -10,38 +10,38 @@ from uavmec_jax.training import host
 
 
 def submit_workers(prepare: Callable[[], Path], jobs: int, executor: str, parameters: Mapping[str, Any]) -> list[str]:
-    """Submit workers as one array of jobs, and return their names.
+    """Submit workers as one job array, and return the job ids.
 
     Args:
-        prepare: plans the run and returns its folder; called once submitit is known to take executor and parameters.
-        jobs: workers.
-        executor: of submitit: ``slurm``, ``local``, ``debug``.
+        prepare: plans the run and returns its folder; called after submitit has accepted executor and parameters.
+        jobs: number of workers.
+        executor: submitit's: ``slurm``, ``local`` or ``debug``.
         parameters: for ``AutoExecutor.update_parameters``, e.g. ``timeout_min``, ``cpus_per_task``, ``slurm_partition``.
 
     Raises:
-        StudyError: submitit is not installed, or knows no such executor or parameter.
+        StudyError: submitit is not installed, or refuses the executor or a parameter.
     """
     submitit = host.optional("submitit", "submit", "cluster")
 
-    def queue(folder: Path) -> Any:
+    def make_executor(folder: Path) -> Any:
         try:
-            made = submitit.AutoExecutor(folder=folder, cluster=executor)
+            auto_executor = submitit.AutoExecutor(folder=folder, cluster=executor)
         except (RuntimeError, ValueError) as error:
             raise StudyError(f"--executor {executor}: {error}") from None
         try:
-            made.update_parameters(name="uavmec", **parameters)
+            auto_executor.update_parameters(name="uavmec", **parameters)
         except (NameError, TypeError, AssertionError) as error:
             raise StudyError(f"--with: {error}") from None
-        return made
+        return auto_executor
 
-    queue(Path(tempfile.gettempdir()))
+    make_executor(Path(tempfile.gettempdir()))
     directory = prepare()
-    jobs_of_run = queue(directory / "log" / "jobs")
-    return [job.job_id for job in jobs_of_run.map_array(_work, [str(directory)] * jobs)]
+    executor_of_run = make_executor(directory / "log" / "jobs")
+    return [job.job_id for job in executor_of_run.map_array(_work, [str(directory)] * jobs)]
 
 
 def _work(directory: str) -> bool:
-    """What runs on a node: one worker with the cores that the scheduler gave it."""
+    """Run one worker on a node, with the cores that the scheduler assigned to it."""
     host.use_all_cores()
     from uavmec_jax.runs.shared_run import work_on
 

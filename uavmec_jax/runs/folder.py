@@ -1,4 +1,4 @@
-"""The folder of a run: a checked plan, a folder per shard, and the state of every shard."""
+"""The folder of a run: the run plan, one folder per shard, and the state of every shard."""
 
 import hashlib
 import json
@@ -21,11 +21,11 @@ from uavmec_jax.training import host
 from uavmec_jax.training.partition import Partition
 
 SCHEMA = 1
-"""Version of a run plan's file."""
+"""Version of the run plan's file."""
 
 RUN_PLAN, LOG, SHARDS, TOUR = "run_plan.json", "log", "shards", "tour.json"
 
-State = Literal["waiting", "running", "stopped", "failed", "done"]
+ShardState = Literal["waiting", "running", "stopped", "failed", "done"]
 
 
 class RunFolder:
@@ -33,7 +33,7 @@ class RunFolder:
 
     Attributes:
         path: the folder.
-        facts: contents of its plan, checked.
+        facts: the checked contents of its run plan.
     """
 
     def __init__(self, path: Path, facts: dict[str, Any]) -> None:
@@ -42,7 +42,7 @@ class RunFolder:
 
     @classmethod
     def create(cls, path: Path, study: Study, plan: RunPlan, options: RunOptions, label: dict[str, Any]) -> "RunFolder":
-        """Write study and plan into an existing folder, the plan last."""
+        """Write the study and the run plan into an existing folder, the plan last."""
         text = study_toml(study)
         write_text(path / STUDY, text)
         facts = {
@@ -60,11 +60,11 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: Path) -> "RunFolder":
-        """Read a run's plan.
+        """Read a run plan.
 
         Raises:
-            StudyError: the folder holds no run, its plan or its study is damaged or was altered, or it was written by a
-                newer version.
+            StudyError: the folder holds no run; the run plan or the study was altered or is damaged; or another version
+                wrote it.
         """
         file = path / RUN_PLAN
         if not file.is_file():
@@ -90,9 +90,9 @@ class RunFolder:
 
     @cached_property
     def plan(self) -> RunPlan:
-        """How the study is cut."""
+        """How the study is partitioned."""
         facts = dict(self.facts["plan"])
-        facts["partitions"] = {name: Partition(**cut) for name, cut in facts["partitions"].items()}
+        facts["partitions"] = {name: Partition(**fields) for name, fields in facts["partitions"].items()}
         return RunPlan(**facts)
 
     @cached_property
@@ -102,54 +102,54 @@ class RunFolder:
 
     @property
     def fingerprint(self) -> str:
-        """Identity of the run, which every file in the folder carries."""
+        """Identity of the run, which its checkpoints carry."""
         return str(self.facts["sha256"])
 
     def other_code(self) -> list[str]:
-        """List how code and libraries differ from those that planned the run."""
+        """List how code and libraries differ from those that the run was planned with."""
         now = {"uavmec_jax's code": host.code_digest()} | host.versions()
         then = {"uavmec_jax's code": self.facts["code_sha256"]} | self.facts["versions"]
         return [f"{name} {then.get(name, '?')[:12]} -> {now[name][:12]}" for name in now if now[name] != then.get(name)]
 
     def check_code(self) -> None:
-        """Check that code and libraries are those that planned the run: only then are the bits the same.
+        """Check that code and libraries are those of the run plan: only then are the results the same to the bit.
 
         Raises:
-            StudyError: the run was planned by other code or other versions of the libraries.
+            StudyError: the run was planned with other code or other versions of the libraries.
         """
         if differ := self.other_code():
             raise StudyError(
-                f"{self.path}: was planned by other code ({', '.join(differ)}), whose bits would differ; "
-                "resume it with that code, or say --other-code"
+                f"{self.path}: was planned with other code ({', '.join(differ)}), so the results could differ; "
+                "resume it with that code, or give --other-code"
             )
 
     def check_reward(self, given: Any) -> None:
-        """Check that a Python reward function, which the plan cannot hold, is given if and only if the run has one.
+        """Check that a reward function is given if and only if the run was started with one: a file cannot hold it.
 
         Raises:
-            StudyError: the run was started with one and none is given, or the other way round.
+            StudyError: the run needs a reward function and none is given, or the other way round.
         """
         wanted = self.facts["label"].get("reward_function")
         if (wanted is None) != (given is None):
-            say = (
+            reason = (
                 f"was started with the reward function {wanted}; give it to um.runs.resume_run"
                 if wanted
-                else "had none"
+                else "was started without a reward function"
             )
-            raise StudyError(f"{self.path}: reward: the run {say}")
+            raise StudyError(f"{self.path}: reward: the run {reason}")
 
     @property
     def complete(self) -> bool:
-        """Whether the results have been assembled, which is the last step."""
+        """Whether the results have been assembled, the last step of a run."""
         return (self.path / RUN).exists()
 
     @property
     def shards_folder(self) -> Path:
-        """Where the shards are until the run is complete; its lease belongs to who started or resumed the run."""
+        """Where the shards are until the run is complete; whoever started or resumed the run holds its lease."""
         return self.path / SHARDS
 
     def shard_folder(self, shard: Shard) -> Path:
-        """Return the folder of a shard; it is made when the shard is claimed."""
+        """Return the folder of a shard, which is created when the shard is claimed."""
         return self.shards_folder / f"{shard.number:05d}"
 
     def result(self, shard: Shard) -> Path:
@@ -160,8 +160,8 @@ class RunFolder:
         """Return the file that says why a shard failed."""
         return self.shard_folder(shard) / "failed.json"
 
-    def states(self) -> Iterator[tuple[Shard, State, dict[str, Any]]]:
-        """Yield the state of every shard, and the latest report of its holder."""
+    def states(self) -> Iterator[tuple[Shard, ShardState, dict[str, Any]]]:
+        """Yield every shard with its state and what its worker last reported: progress, or why it failed."""
         complete = self.complete
         for shard in self.plan.shards:
             if complete or self.result(shard).exists():

@@ -1,4 +1,4 @@
-"""The label of a run: what is known of it before it starts."""
+"""The label of a run: everything that ``run.json`` says about it before it starts."""
 
 import datetime
 import sys
@@ -14,7 +14,7 @@ from uavmec_jax.training import host
 
 
 def label_of(study: Study, plan: RunPlan, command: str | None) -> dict[str, Any]:
-    """Return what is known of a run before it starts, for ``run.json``."""
+    """Return the label: study, command, start time, partitions, versions and hardware."""
     return {
         "schema": SCHEMA,
         "study": study.name,
@@ -25,6 +25,6 @@ def label_of(study: Study, plan: RunPlan, command: str | None) -> dict[str, Any]
         "seeds": seeds_of(study),
         **({"places": places} if (places := describe_places(study)) else {}),
         "workers": plan.workers,
-        "partitions": {name: asdict(cut) for name, cut in plan.partitions.items()},
+        "partitions": {name: asdict(partition) for name, partition in plan.partitions.items()},
         **host.describe(),
     }

@@ -1,5 +1,6 @@
 """The log of a run: JSON lines, one file per process; TensorBoard event files on request."""
 
+import io
 import json
 import logging
 import os
@@ -26,12 +27,12 @@ class RunLog:
         """Open the log.
 
         Args:
-            folder: of the log files; made when the first event is logged.
+            folder: folder of the log files; created when the first event is logged.
             tensorboard: whether curves are also written as TensorBoard event files, beside the folder.
             on_event: called with every event and its facts.
 
         Raises:
-            StudyError: TensorBoard's writer is wanted and not installed.
+            StudyError: ``tensorboard`` is set and tensorboardX is not installed.
         """
         self._logger = logging.Logger("uavmec_jax.run", logging.INFO)
         self._logger.addHandler(_JsonLinesHandler(folder / f"{socket.gethostname()}-{os.getpid()}.jsonl"))
@@ -40,7 +41,7 @@ class RunLog:
         self._on_event = on_event
 
     def event(self, name: str, **facts: Any) -> None:
-        """Log an event; the values of ``facts`` are what JSON can hold."""
+        """Log an event with its facts, which JSON must be able to hold."""
         self._logger.info(name, extra={"facts": facts})
         self._on_event(name, facts)
 
@@ -55,7 +56,7 @@ class RunLog:
 
 
 class _JsonFormatter(logging.Formatter):
-    """One JSON object per line: the event, the wall clock, and the event's facts."""
+    """Formats an event as one JSON object: ``event``, ``at`` (seconds since the epoch) and the event's facts."""
 
     def format(self, record: logging.LogRecord) -> str:
         facts: dict[str, Any] = record.facts  # type: ignore[attr-defined]
@@ -63,23 +64,27 @@ class _JsonFormatter(logging.Formatter):
 
 
 class _JsonLinesHandler(logging.FileHandler):
-    """Appends lines to a file whose folder is made when it is opened; on a full disk the log has a gap."""
+    """Appends lines to a file; while they cannot be written, they are dropped and the run goes on.
+
+    The file is not buffered: a line that a full disk refuses is neither kept nor written again later.
+    """
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, encoding="utf-8", delay=True)
         self.setFormatter(_JsonFormatter())
 
     def _open(self) -> Any:
-        Path(self.baseFilename).parent.mkdir(parents=True, exist_ok=True)
-        return super()._open()
+        path = Path(self.baseFilename)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return io.TextIOWrapper(path.open("ab", buffering=0), encoding=self.encoding, write_through=True)
 
-    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 (logging calls it so)
-        """Ignore what the disk refuses: a run reports that when it writes its next checkpoint."""
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 (the name is logging's)
+        """Ignore a full disk: the run reports it when it writes its next checkpoint."""
         if not isinstance(sys.exc_info()[1], OSError):
             super().handleError(record)
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write a line; a folder that cannot be made is ignored like a full disk."""
+        """Write a line; a folder that cannot be created is ignored like a full disk."""
         try:
             super().emit(record)
         except OSError:

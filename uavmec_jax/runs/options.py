@@ -1,12 +1,12 @@
-"""How a run is checkpointed and logged. Imports nothing heavy: the command line reads names and defaults from here."""
+"""Options of a run. The command line reads its defaults from here, so nothing heavy is imported."""
 
 from dataclasses import dataclass
 from typing import Literal, get_args
 
 CheckpointKind = Literal["full", "weights"]
 CHECKPOINT_KINDS: tuple[CheckpointKind, ...] = get_args(CheckpointKind)
-"""``full``: everything, a shard resumes from there. ``weights``: the present policies, small; a shard that was stopped is
-trained again from its start."""
+"""``full``: the whole training state, from which a shard resumes. ``weights``: only the current policies, which is small; a
+shard that was stopped is trained again from its start."""
 
 
 @dataclass(frozen=True)
@@ -14,9 +14,9 @@ class RunOptions:
     """How a run is checkpointed and logged.
 
     Attributes:
-        checkpoint: what is saved of a shard in training.
-        checkpoint_every_s: least time between two checkpoints.
-        checkpoint_share: largest share of the time that they may take; large ones are further apart.
+        checkpoint: what a checkpoint of a shard in training holds.
+        checkpoint_every_s: least seconds between two checkpoints.
+        checkpoint_share: largest share of the time spent on checkpoints: large ones are written less often.
         lease_s: seconds without a heartbeat after which a worker on another machine counts as dead.
         tensorboard: whether curves are also written as TensorBoard event files.
     """

@@ -1,4 +1,4 @@
-"""Results of runs on disk: assembled from their shards, and loaded again, complete or partial."""
+"""Results of runs: assembled from their shards, and loaded again, complete or partial."""
 
 import shutil
 from collections.abc import Callable, Iterable
@@ -18,7 +18,7 @@ def check_directory(directory: Path) -> None:
     """Refuse a folder that cannot take a run or a tour.
 
     Raises:
-        StudyError: it is not empty, somebody is at work in it, or it is a file.
+        StudyError: it is not empty, another process works in it, or it is a file.
     """
     if (holder := Leases().holder(directory / SHARDS)) is not None:
         raise StudyError(f"{directory}: {describe_holder(holder)} is at work in it{worker_hint(directory)}")
@@ -29,29 +29,32 @@ def check_empty(directory: Path) -> None:
     """Refuse a folder that holds anything but leases.
 
     Raises:
-        StudyError: one line that says what it holds.
+        StudyError: it holds a run, a tour or other files, or is a file.
     """
     if any((directory / name).exists() for name in (RUN, STUDY, RUN_PLAN)):
         raise StudyError(
-            f"{directory}: already holds a run; go on with it by `uavmec resume`, or give another folder with --out"
+            f"{directory}: already holds a run; resume it with `uavmec resume`, or give another folder with --out"
         )
     if (directory / TOUR).exists():
         raise StudyError(f"{directory}: already holds a tour of `uavmec plan`; give another folder with --out")
-    if directory.exists() and not directory.is_dir():
-        raise StudyError(f"{directory}: exists and is not an empty folder; give another one with --out")
-    if directory.exists() and any(file.name != SHARDS for file in directory.iterdir()):
+    if directory.exists() and not (directory.is_dir() and all(file.name == SHARDS for file in directory.iterdir())):
         raise StudyError(f"{directory}: exists and is not an empty folder; give another one with --out")
 
 
 def worker_hint(directory: Path) -> str:
-    """Say how to help with a run that somebody is working on."""
+    """Return how to join the workers of a run, as the end of a message."""
     return f"; to help it, start `uavmec worker {directory}`"
 
 
 def assemble_results(folder: RunFolder, shards: Iterable[ShardResult], **more: Any) -> Results:
     """Assemble the results of a run whose shards are all finished, and remove the shards' own files.
 
-    However often and by whomever it is done, the files are the same. ``more`` is added to the run's label.
+    Assembling twice gives the same files.
+
+    Args:
+        folder: the run.
+        shards: the results of all of its shards, in their order.
+        more: added to the run's label.
 
     Raises:
         StudyError: an agent occurs twice, or is missing.
@@ -60,7 +63,7 @@ def assemble_results(folder: RunFolder, shards: Iterable[ShardResult], **more: A
     axes = [name for name in results.agents if name in ("seed", *cell_axes(folder.study))]
     if len(results.agents) != folder.plan.agents or results.agents.duplicated(axes).any():
         raise StudyError(
-            f"{folder.path}: its shards hold {len(results.agents):,} agents, the plan has {folder.plan.agents:,}, each once"
+            f"{folder.path}: its shards hold {len(results.agents):,} agents; the plan has {folder.plan.agents:,}, each once"
         )
     results.save(folder.path)
     shutil.rmtree(folder.shards_folder, ignore_errors=True)
@@ -68,19 +71,19 @@ def assemble_results(folder: RunFolder, shards: Iterable[ShardResult], **more: A
 
 
 def finished_shards(folder: RunFolder) -> list[ShardResult]:
-    """Read the shards that are finished by now.
+    """Read the results of the shards that are finished so far.
 
     Raises:
-        StudyError: the file of one is damaged.
+        StudyError: the file of a shard is damaged.
     """
     return [ShardResult.read(folder.result(shard)) for shard, state, _ in folder.states() if state == "done"]
 
 
 def read_finished_shards(folder: RunFolder, log_event: Callable[..., None]) -> tuple[list[ShardResult], list[int]]:
-    """Read the finished shards; report and set aside damaged files, whose shards are no longer finished.
+    """Read the results of finished shards; log and rename damaged files, whose shards then are to be run again.
 
     Returns:
-        The intact shards, and the numbers of the damaged ones.
+        The intact results, and the numbers of the damaged shards.
     """
     intact, damaged = [], []
     for shard in folder.plan.shards:
@@ -97,19 +100,21 @@ def read_finished_shards(folder: RunFolder, log_event: Callable[..., None]) -> t
 
 
 def partial_results(folder: RunFolder) -> Results:
-    """Assemble the results of the shards that are finished by now, in memory.
+    """Assemble the results of the shards that are finished so far, in memory.
 
     Raises:
-        StudyError: the file of one is damaged.
+        StudyError: the file of a shard is damaged.
     """
     return Results.of(folder.study, folder.facts["label"], finished_shards(folder), folder.plan.agents)
 
 
 def load_results(directory: str | Path) -> Results:
-    """Load the results of a run (all but its weights, see :func:`load_weights`); of an unfinished run, as far as it is.
+    """Load the results of a run, all but its weights (see :func:`load_weights`).
+
+    Of an unfinished run, the results are those of its finished shards.
 
     Raises:
-        StudyError: the folder holds no run, a file of it is damaged, or it was written by another version.
+        StudyError: the folder holds no run, a file is damaged, or another version wrote it.
     """
     directory = Path(directory)
     if not (directory / RUN).exists() and (directory / RUN_PLAN).exists():

@@ -1,4 +1,4 @@
-"""Run a study in this process or by several, start to finish or resumed, and assemble the results."""
+"""Run a study in one process or several, or resume a run, and assemble its results."""
 
 import shutil
 import time
@@ -49,24 +49,24 @@ def run_study(
 ) -> Results:
     """Train and evaluate the population of a study.
 
-    With a directory, the run can be resumed whatever happens: see :func:`resume_run`. Ctrl-C or SIGTERM end it early; the
+    With a directory, the run can be resumed whatever happens, see :func:`resume_run`. Ctrl-C and SIGTERM end it early: the
     results then hold the finished shards, ``run["complete"]`` is False and ``run["stopped_by"]`` is the signal's number.
 
     Args:
         study: from :func:`um.load_study`.
-        directory: where to save; ``None`` saves nothing.
-        reward: a function of the terms (see :func:`um.make_reward`) that replaces the study's reward; the run's label
-            then names it.
+        directory: folder of the run; ``None`` saves nothing.
+        reward: a function of the reward's terms (see :func:`um.make_reward`) that replaces the study's reward; the run's
+            label then names it.
         command: the command line, for the label of the results.
-        workers: processes; more than one need a directory.
-        shard_size: most agents in a shard; by default what the devices' caches hold.
+        workers: number of processes; more than one need a directory.
+        shard_size: most agents in a shard; by default as many as the devices' caches hold.
         options: how the run is checkpointed and logged.
         on_progress: called after every chunk.
         on_event: called with ``(event, facts)`` of everything that is logged.
 
     Raises:
-        StudyError: the population does not fit, the directory cannot take a run or somebody is at work in it, shards
-            have failed, ``reward`` is given beside an axis of rewards, or tensorboardX is wanted and not installed.
+        StudyError: the population does not fit in memory, the directory cannot take a run or another process works in it,
+            shards failed, ``reward`` is given beside an axis of rewards, or tensorboardX is needed and not installed.
     """
     if reward is not None and "reward" in study.axes:
         raise StudyError(f"{study.name}: axes.reward is given, and a reward function too; leave one of them out")
@@ -104,21 +104,21 @@ def resume_run(
     on_progress: OnProgress = lambda _: None,
     on_event: OnEvent = lambda event, facts: None,
 ) -> Results:
-    """Resume a run that was stopped or killed; it ends with the bits of a run that was not.
+    """Resume a run that was stopped or killed; its results are those of an uninterrupted run, to the bit.
 
-    Finished shards are kept, the others resume from their last intact checkpoint; shards that failed are tried again.
+    Finished shards are kept, the others resume from their last intact checkpoint; failed shards are run again.
 
     Args:
-        directory: of the run.
-        reward: the function that the run was started with, if any.
-        workers: processes; by default as many as the run was planned for.
-        other_code: resume although code or libraries are not those that planned the run; its label then says so.
+        directory: folder of the run.
+        reward: the reward function that the run was started with, if any.
+        workers: number of processes; by default as many as the run was planned for.
+        other_code: resume although code or libraries have changed since the run was planned; its label then says so.
         on_progress: called after every chunk.
         on_event: called with ``(event, facts)`` of everything that is logged.
 
     Raises:
-        StudyError: the directory holds no run, its plan is damaged, somebody is at work in it, it needs its reward
-            function or was planned by other code.
+        StudyError: the directory holds no run, the run plan is damaged, another process works in it, or the run needs
+            its reward function or was planned with other code.
     """
     path = Path(directory)
     folder = RunFolder.open(path)
@@ -142,7 +142,7 @@ def resume_run(
 def run_or_resume(
     study: Study, directory: str | Path, *, command: str | None = None, on_progress: OnProgress = lambda _: None
 ) -> Results:
-    """Run a study in a folder, or resume the run that is there; the results of a complete one are loaded."""
+    """Run a study in a folder; if it holds a run, resume that, or load its results if it is complete."""
     if (Path(directory) / RUN_PLAN).exists():
         return resume_run(directory, on_progress=on_progress)
     return run_study(study, directory, command=command, on_progress=on_progress)
@@ -156,7 +156,7 @@ def _run(
     on_event: OnEvent,
     label: Mapping[str, Any] = MappingProxyType({}),
 ) -> Results:
-    """Work until all shards are finished, and assemble the results."""
+    """Run all shards that are not finished, and assemble the results."""
     with StopSignal() as stop:
         worker = make_worker(path, runner=runner, stop=stop, on_progress=on_progress, on_event=on_event)
         folder = worker.folder
@@ -181,31 +181,32 @@ def _run(
 
 
 def _check_failures(folder: RunFolder) -> None:
+    """Raise a StudyError if a shard has failed."""
     failed = [(shard, facts) for shard, state, facts in folder.states() if state == "failed"]
     if failed:
         shard, facts = failed[0]
         raise StudyError(
             f"{folder.path}: {len(failed)} of {len(folder.plan.shards)} shards failed, shard {shard.number} with "
-            f"{facts.get('error', 'an unknown error')} ({folder.failure(shard)}); `uavmec resume {folder.path}` tries them "
+            f"{facts.get('error', 'an unknown error')} ({folder.failure(shard)}); `uavmec resume {folder.path}` runs them "
             "again"
         )
 
 
 def _run_in_memory(study: Study, plan: RunPlan, runner: ShardRunner, label: dict, on_progress: OnProgress) -> Results:
-    """Train and evaluate shard after shard in this process, saving nothing."""
+    """Train and evaluate one shard after the other in this process, and save nothing."""
     finished: list[ShardResult] = []
     done = 0
     interrupted = False
     try:
         for shard in plan.shards:
-            tick = time.perf_counter()
+            started = time.perf_counter()
             training = runner.start(shard)
             if training is not None:
                 for _ in training.run():
                     steps = done + shard.agents * training.steps
                     on_progress(Progress(shard.number, steps, plan.work, training.mean_episode_length))
             finished.append(runner.finish(shard, training))
-            finished[-1].seconds["wall"] = time.perf_counter() - tick
+            finished[-1].seconds["wall"] = time.perf_counter() - started
             done += plan.work_of(shard)
             if training is None:
                 on_progress(Progress(shard.number, done, plan.work, float("nan")))

@@ -1,4 +1,4 @@
-"""The run plan: how a study is cut into shards and what it costs, known before anything is compiled or written."""
+"""The run plan: how a study is cut into shards, and the memory it needs, before anything is compiled or written."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,18 +16,18 @@ _UNTRAINED_SHARD = 100
 """Scenarios in a shard where nothing is trained."""
 
 BYTES_WITHOUT_TRAINING = 100_000
-"""A finished agent, in memory and on disk: two sets of weights, evaluation, curves."""
+"""Bytes of a finished agent, in memory and on disk: two sets of weights, evaluation, curves."""
 
 
 @dataclass(frozen=True)
 class Shard:
-    """Agents of one algorithm that one process trains and evaluates as one piece.
+    """Agents of one algorithm that one process trains and evaluates together.
 
     Attributes:
-        number: in the plan, from 0.
-        algorithm: its name, ``none`` where nothing is trained.
-        first: its first agent, among those of the algorithm.
-        agents: number of agents; a shard is padded to the size of all others.
+        number: its place in the plan, from 0.
+        algorithm: name of the algorithm, ``none`` where nothing is trained.
+        first: its first agent, counted among those of the algorithm.
+        agents: number of agents, without the padding to the common size of the algorithm's shards.
     """
 
     number: int
@@ -38,15 +38,15 @@ class Shard:
 
 @dataclass(frozen=True)
 class RunPlan:
-    """How a study is cut. It is part of the result: the last bits depend on the size of a group of agents.
+    """How a study is cut into shards. It is part of the result: the last bits depend on the size of a group.
 
     Attributes:
-        agents: of all algorithms.
-        partitions: algorithm -> how its agents are cut.
+        agents: number of agents of all algorithms.
+        partitions: algorithm -> how its agents are partitioned.
         members: algorithm -> number of its agents.
         steps: algorithm -> environment steps of one agent, in whole iterations; 0 where nothing is trained.
-        workers: processes that it was made for.
-        free_bytes: memory that was free.
+        workers: number of processes that the plan is made for.
+        free_bytes: free memory when the plan was made.
     """
 
     agents: int
@@ -58,11 +58,11 @@ class RunPlan:
 
     @cached_property
     def shards(self) -> list[Shard]:
-        """The shards in the order of the results: algorithm after algorithm."""
+        """The shards in the order of the results, one algorithm after the other."""
         shards: list[Shard] = []
-        for name, cut in self.partitions.items():
-            for first in range(0, cut.shards * cut.shard_size, cut.shard_size):
-                agents = min(cut.shard_size, self.members[name] - first)
+        for name, partition in self.partitions.items():
+            for first in range(0, partition.shards * partition.shard_size, partition.shard_size):
+                agents = min(partition.shard_size, self.members[name] - first)
                 shards.append(Shard(len(shards), name, first, agents))
         return shards
 
@@ -73,22 +73,22 @@ class RunPlan:
 
     @property
     def work(self) -> int:
-        """The unit of progress: environment steps, or scenarios where nothing is trained."""
+        """The whole work that progress counts: environment steps, or scenarios where nothing is trained."""
         return self.total_steps or self.agents
 
     def work_of(self, shard: Shard) -> int:
-        """Return a shard's part of :attr:`work`."""
+        """Return a shard's share of :attr:`work`."""
         return shard.agents * (self.steps[shard.algorithm] or 1)
 
     def __str__(self) -> str:
         if not self.total_steps:
             return f"{self.agents} scenarios, nothing is trained"
-        cuts, count = list(self.partitions.values()), len(self.shards)
-        sizes = "+".join(f"{cut.shards} x {cut.shard_size}" for cut in cuts)
-        of_size = f" ({sizes})" if len(cuts) > 1 else f" of {cuts[0].shard_size}"
-        needed = self.workers * max(cut.shard_bytes for cut in cuts)
+        partitions, count = list(self.partitions.values()), len(self.shards)
+        sizes = "+".join(f"{partition.shards} x {partition.shard_size}" for partition in partitions)
+        of_size = f" ({sizes})" if len(partitions) > 1 else f" of {partitions[0].shard_size}"
+        needed = self.workers * max(partition.shard_bytes for partition in partitions)
         memory = f"{needed / 2**30:.2f} GiB of {self.free_bytes / 2**30:.1f} GiB free"
-        groups = max(cut.groups for cut in cuts)
+        groups = max(partition.groups for partition in partitions)
         devices = f"{groups} device{'s' * (groups > 1)}"
         devices = f"{self.workers} workers with {devices} each" if self.workers > 1 else devices
         steps = self.total_steps // self.agents
@@ -96,17 +96,17 @@ class RunPlan:
 
 
 def plan_run(study: Study, *, workers: int = 1, shard_size: int | None = None, jobs: int = 1) -> RunPlan:
-    """Estimate memory and cut the population into equal shards.
+    """Estimate the memory of a study and cut its population into equal shards.
 
     Args:
-        study: what is run.
-        workers: processes on this host that share its devices and its memory.
-        shard_size: most agents in a shard; by default what the devices' caches hold.
-        jobs: workers on all hosts together; there is a shard for each, if there are as many agents.
+        study: the study to run.
+        workers: processes on this host, which share its devices and its memory.
+        shard_size: most agents in a shard; by default as many as the devices' caches hold.
+        jobs: workers on all hosts together; if there are enough agents, each has a shard.
 
     Raises:
         StudyError: the population does not fit in memory.
-        TrafficError: a place of the study is not usable.
+        TrafficError: the traffic of one of the study's places is not usable.
     """
     load_evacuations(study)
     agents, free = n_agents(study), host.free_memory()
@@ -114,21 +114,21 @@ def plan_run(study: Study, *, workers: int = 1, shard_size: int | None = None, j
     if needed > free:
         raise StudyError(
             f"{study.name}: {agents:,} agents need {needed / 2**30:,.0f} GiB of memory, and as much disk, when all are "
-            f"trained; {free / 2**30:.1f} GiB are free; shorten an axis, or make several studies of it"
+            f"trained; {free / 2**30:.1f} GiB are free; shorten an axis, or split it into several studies"
         )
     partitions: dict[str, Partition] = {}
     members: dict[str, int] = {}
     steps: dict[str, int] = {}
-    for own in split_by_algorithm(study):
-        algorithm, count = make_algorithm(own), n_agents(own)
+    for part in split_by_algorithm(study):
+        name, algorithm, count = part.algorithm, make_algorithm(part), n_agents(part)
         max_shard = min(shard_size or count, -(-count // max(workers, jobs)))
-        members[own.algorithm], steps[own.algorithm] = count, algorithm.total_steps if algorithm else 0
+        members[name], steps[name] = count, algorithm.total_steps if algorithm else 0
         if algorithm is None:
             size = min(_UNTRAINED_SHARD, max_shard)
-            partitions[own.algorithm] = Partition(shards=-(-count // size), shard_size=size, groups=1, shard_bytes=0)
+            partitions[name] = Partition(shards=-(-count // size), shard_size=size, groups=1, shard_bytes=0)
             continue
         try:
-            partitions[own.algorithm] = partition_population(
+            partitions[name] = partition_population(
                 count,
                 algorithm.agent_bytes,
                 (free - needed) // workers,

@@ -28,26 +28,32 @@ from uavmec_jax.studies.shard_result import ShardResult
 from uavmec_jax.training.training import Trainer, Training, Validation
 
 _SCENARIO_AXES = ("seed", "powered", "connected", "scenarios", "place", *TRACED_PARAMS)
-"""Axes of the scenario that an agent plays; all others are about its training (as is the seed of drawn scenarios)."""
+"""Axes that change an agent's scenario; all others concern its training, as does the seed of drawn scenarios."""
 
 
 class ShardRunner:
-    """Trains and evaluates shards of one study; every algorithm is compiled once."""
+    """Trains and evaluates the shards of one study; each algorithm is compiled once."""
 
     def __init__(self, study: Study, plan: RunPlan, reward: Callable[[Mapping[str, Any]], Any] | None = None) -> None:
-        """Prepare for a study; ``reward`` is a function of the reward's terms that replaces the study's reward."""
-        own = make_reward(reward, study.guard) if reward is not None else None
+        """Prepare for a study.
+
+        Args:
+            study: the study.
+            plan: how it is cut into shards.
+            reward: a function of the reward's terms that replaces the study's reward.
+        """
+        replacement = make_reward(reward, study.guard) if reward is not None else None
         self._runners = {
-            part.algorithm: _AlgorithmRunner(part, plan, "algorithm" in study.axes, own)
+            part.algorithm: _AlgorithmRunner(part, plan, "algorithm" in study.axes, replacement)
             for part in split_by_algorithm(study)
         }
 
     def start(self, shard: Shard) -> Training | None:
-        """Return the shard before its first step; ``None`` if nothing is trained."""
+        """Start the training of a shard; ``None`` where nothing is trained."""
         return self._runners[shard.algorithm].start(shard)
 
     def finish(self, shard: Shard, training: Training | None) -> ShardResult:
-        """Evaluate a shard that is trained to the end, or needs no training."""
+        """Evaluate a shard whose training is finished, or which needs none."""
         return self._runners[shard.algorithm].finish(shard, training)
 
     def agent_ids(self, shard: Shard) -> list[AgentId]:
@@ -57,15 +63,15 @@ class ShardRunner:
 
 @dataclass
 class _AlgorithmRunner:
-    """Runs the shards of one algorithm of a study, or those where nothing is trained."""
+    """Runs the shards of a study of one algorithm, or of none."""
 
     study: Study
     plan: RunPlan
     names_algorithm: bool
-    """Whether the table names the algorithm."""
+    """Whether the table of agents has a column for the algorithm."""
     reward: Reward | None
     trainer: Trainer | None = None
-    """Compiled for the first shard."""
+    """Compiled with the first shard."""
 
     @cached_property
     def agent_ids(self) -> list[AgentId]:
@@ -76,7 +82,7 @@ class _AlgorithmRunner:
         return make_algorithm(self.study)
 
     def members(self, shard: Shard) -> tuple[list[AgentId], Agent]:
-        """The agents of a shard, the last one repeated as padding."""
+        """Make the agents of a shard; the last one is repeated as padding."""
         size = self.plan.partitions[self.study.algorithm].shard_size
         agent_ids = self.agent_ids[shard.first : shard.first + shard.agents]
         agent_ids = agent_ids + [agent_ids[-1]] * (size - shard.agents)
@@ -97,7 +103,7 @@ class _AlgorithmRunner:
         return training
 
     def finish(self, shard: Shard, training: Training | None) -> ShardResult:
-        tick = time.perf_counter()
+        started = time.perf_counter()
         agent_ids, agents = self.members(shard)
         keys = evaluation_keys(self.study, agent_ids)
         members, keys = jax.tree.map(lambda leaf: leaf[: shard.agents], (agents, keys))
@@ -121,7 +127,7 @@ class _AlgorithmRunner:
             )
             learned = evaluate_learned(self.algorithm, members, keys, weights)
         columns, evaluation, planning = evaluate_all(members, keys, learned, distinct, self.study.evaluation)
-        seconds = {"evaluate": time.perf_counter() - tick - planning, "plan": planning}
+        seconds = {"evaluate": time.perf_counter() - started - planning, "plan": planning}
         return ShardResult(
             algorithm=self.study.algorithm,
             rows=rows.assign(**columns),
@@ -134,6 +140,6 @@ class _AlgorithmRunner:
 
 
 def _scenario_columns(rows: pd.DataFrame) -> list[str]:
-    """The columns that tell the scenarios of agents apart."""
+    """Return the columns by which agents' scenarios differ."""
     drawn = "scenarios" in rows
     return [name for name in rows if name in _SCENARIO_AXES and not (drawn and name == "seed")]

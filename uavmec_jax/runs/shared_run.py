@@ -1,4 +1,4 @@
-"""Runs that are planned by one process and made by workers, on as many machines as share the folder."""
+"""Runs that one process plans and workers carry out, on any number of machines that share the folder."""
 
 from pathlib import Path
 
@@ -31,11 +31,11 @@ def prepare_run(
     jobs: int = 1,
     options: RunOptions | None = None,
 ) -> RunFolder:
-    """RunPlan a run that workers (:func:`work_on`) then make.
+    """Plan a run, which workers (:func:`work_on`) then carry out.
 
     Args:
         study, directory, command, shard_size, options: see :func:`run_study`.
-        workers: processes that share one machine.
+        workers: processes on each machine.
         jobs: workers on all machines together.
 
     Raises:
@@ -59,20 +59,20 @@ def work_on(
     on_progress: OnProgress = lambda _: None,
     on_event: OnEvent = lambda event, facts: None,
 ) -> bool:
-    """Be one more worker of a run, until all of its shards are finished; tells whether they are.
+    """Join the workers of a run until no shard is left, and return whether all are finished.
 
-    The last one to finish puts the results together, unless somebody who started the run waits to do it.
+    The last worker assembles the results, unless the process that started the run is waiting to do so.
 
     Args:
-        directory: of the run, which hosts may share.
-        wait: for shards that others hold, to take over if they die.
-        on_progress: told after every chunk.
-        on_event: told ``(event, facts)`` of everything that is logged.
+        directory: folder of the run, which hosts may share.
+        wait: whether to wait for shards that other workers hold, to take over if those die.
+        on_progress: called after every chunk.
+        on_event: called with ``(event, facts)`` of everything that is logged.
 
     Raises:
-        StudyError: the directory holds no run, its plan is damaged, it was planned by other code, or has a reward
-            function, which only :func:`um.runs.resume_run` can be given.
-        Interrupted: a signal came; what this worker had is kept.
+        StudyError: the directory holds no run, the run plan is damaged, or the run was planned with other code or has a
+            reward function, which only :func:`um.runs.resume_run` takes.
+        Interrupted: a signal arrived; the shard in training has a checkpoint.
     """
     path = Path(directory)
     with StopSignal() as stop:
@@ -90,7 +90,7 @@ def work_on(
 
 
 def _assemble_alone(worker: Worker) -> None:
-    """Unless somebody holds the run who does it: the one that started it, or another worker."""
+    """Assemble the results, unless another process holds the run and will do so."""
     try:
         lease = worker.leases.hold(worker.folder.shards_folder, worker.folder.path)
     except StudyError:

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM end a run between two chunks, so that its state can be saved."""
+"""End a run at SIGINT and SIGTERM between two chunks, so that its state can be saved."""
 
 import signal
 import threading
@@ -9,7 +9,7 @@ from typing import Any
 
 
 class Interrupted(KeyboardInterrupt):
-    """The run was told to stop by the signal number ``signal``."""
+    """The signal with the number ``signal`` stopped the run."""
 
     def __init__(self, signal: int) -> None:
         super().__init__(f"stopped by signal {signal}")
@@ -17,9 +17,9 @@ class Interrupted(KeyboardInterrupt):
 
 
 class StopSignal:
-    """A context in which the two signals are recorded; the run checks them, or allows itself to be interrupted.
+    """Context manager that records the two signals until the run checks for them, or can be interrupted anywhere.
 
-    Outside the main thread, where Python has no signals, nothing is recorded. A second signal always interrupts.
+    A second signal always interrupts. Outside the main thread, where Python has no signals, nothing is recorded.
     """
 
     def __init__(self) -> None:
@@ -38,10 +38,10 @@ class StopSignal:
             signal.signal(number, handler)
 
     def check(self) -> None:
-        """Stop here if a signal came.
+        """Stop here if a signal has arrived.
 
         Raises:
-            Interrupted: it did.
+            Interrupted: one has.
         """
         if self.signal:
             raise Interrupted(self.signal)
@@ -51,7 +51,7 @@ class StopSignal:
         """Enter a section that may be interrupted anywhere.
 
         Raises:
-            Interrupted: a signal came, before or inside.
+            Interrupted: a signal arrived, before the section or inside.
         """
         self.check()
         self._interruptible = True

@@ -1,4 +1,4 @@
-"""How fast the environment and the learners are on this machine."""
+"""Measure the speed of the environment and of training on this machine."""
 
 import time
 from collections.abc import Callable
@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, Float, Int, Key
 
 from uavmec_jax.env.dynamics import Cause, State, initial_state
 from uavmec_jax.env.layout import sample_layout
@@ -22,8 +23,10 @@ from uavmec_jax.training.population import take_padded
 from uavmec_jax.training.programs import Programs, make_mesh, put_on_mesh
 
 
-def random_steps(scenario: Scenario, state: State, key: Any, steps: Any) -> tuple[State, Any]:
-    """Play ``steps`` random slots in one scenario with auto-reset; returns the state and the summed reward."""
+def random_steps(
+    scenario: Scenario, state: State, key: Key[Array, ""], steps: int | Int[Array, ""]
+) -> tuple[State, Float[Array, ""]]:
+    """Take ``steps`` random actions in one scenario with auto-reset, and return the state and the summed reward."""
     n = scenario.layout.capacity.shape[0]
 
     def step(i: Any, carry: tuple[State, Any]) -> tuple[State, Any]:
@@ -37,7 +40,7 @@ def random_steps(scenario: Scenario, state: State, key: Any, steps: Any) -> tupl
 
 
 def environment_speed(n_layouts: int = 4096, seconds: float = 2.0) -> float:
-    """Environment steps per second with random actions, ``n_layouts`` layouts split over all devices."""
+    """Measure the environment steps per second under random actions, with ``n_layouts`` layouts split over all devices."""
     devices = jax.local_devices()
     n_layouts = -(-n_layouts // len(devices)) * len(devices)
     mesh = Mesh(np.array(devices), ("layouts",))
@@ -59,9 +62,9 @@ def environment_speed(n_layouts: int = 4096, seconds: float = 2.0) -> float:
     states, _ = jax.block_until_ready(run(states, keys, 1))
     chunk, best, deadline = max(1, 400_000 // n_layouts), 0.0, time.perf_counter() + seconds
     while time.perf_counter() < deadline:
-        tick = time.perf_counter()
+        started = time.perf_counter()
         states, _ = jax.block_until_ready(run(states, keys, chunk))
-        best = max(best, n_layouts * chunk / (time.perf_counter() - tick))
+        best = max(best, n_layouts * chunk / (time.perf_counter() - started))
     return best
 
 
@@ -73,14 +76,14 @@ def training_speed(
     start: int | None = None,
     prepare: Callable[[Any], Any] = lambda state: state,
 ) -> dict[str, float]:
-    """Environment steps per second of training a study's population, shard after shard as in a real run.
+    """Measure the environment steps per second of training a study's population, shard after shard as in a run.
 
     Args:
-        study: of one algorithm.
-        seconds: of measurement, for all partition together.
+        study: a study of one algorithm.
+        seconds: duration of the measurement, for all shards together.
         warm_up: iterations before the clock starts.
         start: iteration at which the clock starts; by default where the warm-up ended.
-        prepare: applied to the state between the two, e.g. to fill a replay memory.
+        prepare: applied to the state after the warm-up, e.g. to fill a replay buffer.
 
     Returns:
         ``steps_per_second`` and ``compile_seconds``.
@@ -89,24 +92,24 @@ def training_speed(
     assert algorithm is not None
     partition = partition_population(n, algorithm.agent_bytes, host.free_memory())
     mesh = make_mesh(partition.devices)
-    everyone = (make_agents(study), validation_keys(study))
-    tick = time.perf_counter()
-    programs = Programs.compile(algorithm, mesh, take_padded(everyone, 0, partition.shard_size))
-    compile_seconds = time.perf_counter() - tick
+    population = (make_agents(study), validation_keys(study))
+    started = time.perf_counter()
+    programs = Programs.compile(algorithm, mesh, take_padded(population, 0, partition.shard_size))
+    compile_seconds = time.perf_counter() - started
     chunk, rates = max(1, 1000 // algorithm.steps_per_iteration), []
     for shard in range(partition.shards):
-        agents, _ = put_on_mesh(mesh, take_padded(everyone, shard * partition.shard_size, partition.shard_size))
+        agents, _ = put_on_mesh(mesh, take_padded(population, shard * partition.shard_size, partition.shard_size))
         state = prepare(programs.update(agents, programs.init(agents), np.int32(0), np.int32(warm_up)))
         first = warm_up if start is None else start
 
         def train_chunk(state: Any, first: int, agents: Any = agents) -> Any:
             return jax.block_until_ready(programs.update(agents, state, np.int32(first), np.int32(first + chunk)))
 
-        state = train_chunk(state, first)  # into the caches
-        chunks, begun = 0, time.perf_counter()
-        while chunks == 0 or time.perf_counter() - begun < seconds / partition.shards:
+        state = train_chunk(state, first)  # warms the caches
+        chunks, started = 0, time.perf_counter()
+        while chunks == 0 or time.perf_counter() - started < seconds / partition.shards:
             chunks += 1
             state = train_chunk(state, first + chunks * chunk)
         steps = chunks * chunk * algorithm.steps_per_iteration * min(partition.shard_size, n)
-        rates.append(steps / (time.perf_counter() - begun))
+        rates.append(steps / (time.perf_counter() - started))
     return {"steps_per_second": float(np.mean(rates)), "compile_seconds": compile_seconds}

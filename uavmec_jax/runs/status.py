@@ -1,4 +1,4 @@
-"""Where a run stands, from its files alone."""
+"""The status of a run, read from its files alone."""
 
 from collections import Counter
 from dataclasses import asdict, dataclass
@@ -11,18 +11,19 @@ from uavmec_jax.runs.folder import RunFolder
 
 @dataclass(frozen=True)
 class Status:
-    """A look at a run.
+    """The status of a run.
 
     Attributes:
-        directory: of the run.
-        complete: whether the results have been put together.
-        agents: in all.
-        shards: state -> how many shards are in it: ``waiting``, ``running``, ``stopped``, ``failed``, ``done``.
-        steps, total_steps: environment steps made and wanted (scenarios, where nothing is trained).
-        steps_per_second: of all workers together; 0 if nobody trains.
-        seconds_left: at that speed, of training; ``None`` if nobody trains.
-        disk_bytes: of the folder.
-        workers: who is at work, and on what.
+        directory: folder of the run.
+        complete: whether the results have been assembled.
+        agents: number of agents.
+        shards: state -> number of shards: ``waiting``, ``running``, ``stopped``, ``failed``, ``done``.
+        steps: environment steps so far (scenarios, where nothing is trained).
+        total_steps: environment steps of the whole run.
+        steps_per_second: training speed of all workers together; 0 if no shard is running.
+        seconds_left: time left for training at that speed; ``None`` if no shard is running.
+        disk_bytes: size of the folder.
+        workers: the running shards, and the process that works on each.
         failures: shard -> why it failed.
     """
 
@@ -39,15 +40,15 @@ class Status:
     failures: dict[int, str]
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return the status as plain data."""
         return asdict(self)
 
 
 def run_status(directory: str | Path) -> Status:
-    """Where a run stands.
+    """Return the status of the run in a folder.
 
     Raises:
-        StudyError: the folder holds no run, or its plan is damaged.
+        StudyError: the folder holds no run, or the run plan is damaged.
     """
     folder = RunFolder.open(Path(directory))
     plan = folder.plan
@@ -82,7 +83,7 @@ def run_status(directory: str | Path) -> Status:
 
 
 def _size(file: Path) -> int:
-    """Bytes of a file, 0 if it has just gone."""
+    """Return the size of a file, 0 if it has just been removed."""
     try:
         return file.stat().st_size
     except OSError:

@@ -1,4 +1,4 @@
-"""Several workers of one run on this machine: processes, each with its share of the cores."""
+"""Several workers of one run on this machine: one process each, with its share of the cores."""
 
 import signal
 import subprocess
@@ -12,17 +12,22 @@ from uavmec_jax.runs.folder import LOG, RunFolder
 from uavmec_jax.runs.signals import StopSignal
 from uavmec_jax.training.population import Progress
 
-_LOOK_S = 0.5
+_POLL_S = 0.5
+"""Seconds between two checks of the workers."""
 
 
 def work_together(
-    folder: RunFolder, workers: int, stop: StopSignal, on_progress: Callable[[Progress], None], tell: Callable[..., Any]
+    folder: RunFolder,
+    workers: int,
+    stop: StopSignal,
+    on_progress: Callable[[Progress], None],
+    log_event: Callable[..., Any],
 ) -> None:
-    """Start workers and wait until all shards are over; if one dies, the others take over what it had.
+    """Start workers and wait until all shards are finished or have failed; if a worker dies, the others take over.
 
     Raises:
-        StudyError: all have died before the work was done.
-        Interrupted: a signal came; it was passed on, and the workers have kept what they had.
+        StudyError: all workers died before the end.
+        Interrupted: a signal arrived; it was passed on, and the workers have written checkpoints.
     """
     log = folder.path / LOG
     log.mkdir(parents=True, exist_ok=True)
@@ -36,12 +41,12 @@ def work_together(
         try:
             while alive:
                 stop.check()
-                time.sleep(_LOOK_S)
+                time.sleep(_POLL_S)
                 on_progress(team_progress(folder))
-                for worker in [one for one in alive if one.poll() is not None]:
+                for worker in [process for process in alive if process.poll() is not None]:
                     alive.remove(worker)
                     if worker.returncode:
-                        tell("died", pid=worker.pid, exit_code=worker.returncode)
+                        log_event("died", pid=worker.pid, exit_code=worker.returncode)
         except KeyboardInterrupt:
             for worker in alive:
                 worker.send_signal(signal.SIGTERM)
@@ -54,17 +59,17 @@ def work_together(
         last = (log / "workers.err").read_text(encoding="utf-8").strip().rpartition("\n")[2]
         raise StudyError(
             f"{folder.path}: all {workers} workers died, {len(left)} of {len(folder.plan.shards)} shards are left"
-            f"{f'; the last one said: {last}' if last else ''}; `uavmec resume {folder.path}` goes on"
+            f"{f'; the last error: {last}' if last else ''}; `uavmec resume {folder.path}` resumes the run"
         )
 
 
 def team_progress(folder: RunFolder) -> Progress:
-    """How far all workers are together, from what they tell with their leases."""
-    plan, steps, over = folder.plan, 0, 0
+    """Return the progress of all workers together, from their leases."""
+    plan, steps, closed = folder.plan, 0, 0
     for shard, state, facts in folder.states():
         if state in ("done", "failed"):
             steps += plan.work_of(shard)
-            over += 1
+            closed += 1
         else:
             steps += int(facts.get("steps", 0))
-    return Progress(max(over - 1, 0), steps, plan.work, float("nan"))
+    return Progress(max(closed - 1, 0), steps, plan.work, float("nan"))

@@ -1,4 +1,4 @@
-"""A worker: claims shards of a run, trains and evaluates them, and takes over those of workers that died."""
+"""A worker: claims the shards of a run, trains and evaluates them, and takes over from workers that died."""
 
 import json
 import time
@@ -25,7 +25,7 @@ from uavmec_jax.training.training import Training
 OnProgress = Callable[[Progress], None]
 
 POLL_S = 1.0
-"""Seconds between checks of shards that others hold."""
+"""Seconds between checks of shards that other workers hold."""
 
 
 @dataclass
@@ -33,12 +33,12 @@ class Worker:
     """One process that works on a run.
 
     Attributes:
-        folder: of the run.
-        runner: trains and evaluates.
+        folder: folder of the run.
+        runner: trains and evaluates shards.
         stop: checked between chunks.
-        log: of this process.
+        log: log of this process.
         on_progress: called after every chunk and shard.
-        leases: of this process.
+        leases: claims shards for this process.
     """
 
     folder: RunFolder
@@ -48,14 +48,14 @@ class Worker:
     on_progress: OnProgress = lambda _: None
     leases: Leases = field(default_factory=Leases)
     _closed: dict[int, int] = field(default_factory=dict)
-    """Shard -> the work done in it, of those that are finished or have failed."""
+    """Finished and failed shards -> the work that they count for."""
 
     def work(self, *, wait: bool = True) -> None:
-        """Work until every shard is finished or has failed; without ``wait``, until none is free.
+        """Work until every shard is finished or has failed; without ``wait``, until no shard is free.
 
         Raises:
-            Interrupted: a signal came; the present shard is checkpointed.
-            StudyError: something could not be written.
+            Interrupted: a signal arrived; the current shard has a checkpoint.
+            StudyError: a file could not be written.
         """
         while True:
             claimed = self._claim()
@@ -68,19 +68,19 @@ class Worker:
                     time.sleep(min(POLL_S, self.leases.lease_s / 4))
 
     def reopen(self, shards: Iterable[int]) -> None:
-        """Work on these shards again: their results turned out to be damaged."""
+        """Run these shards again, because their results turned out to be damaged."""
         for number in shards:
             self._closed.pop(number, None)
 
     def _claim(self) -> tuple[Shard, Lease] | None:
-        """Claim the first shard that nobody works on."""
+        """Claim the first shard that no worker holds."""
         for shard in self.folder.plan.shards:
             if shard.number in self._closed or self._is_closed(shard):
                 continue
-            place = self.folder.shard_folder(shard)
-            taken_over = self.leases.taken_over(place)
-            if (lease := self.leases.claim(place)) is not None:
-                if self._is_closed(shard):  # somebody finished it in between
+            shard_folder = self.folder.shard_folder(shard)
+            taken_over = self.leases.taken_over(shard_folder)
+            if (lease := self.leases.claim(shard_folder)) is not None:
+                if self._is_closed(shard):  # another worker has just finished it
                     lease.release()
                     continue
                 self.log.event("claimed", shard=shard.number, claim=lease.number, taken_over=taken_over)
@@ -88,6 +88,7 @@ class Worker:
         return None
 
     def _is_closed(self, shard: Shard) -> bool:
+        """Return whether a shard is finished or has failed."""
         if self.folder.complete or self.folder.result(shard).exists():
             self._closed[shard.number] = self.folder.plan.work_of(shard)
         elif self.folder.failure(shard).exists():
@@ -95,25 +96,25 @@ class Worker:
         return shard.number in self._closed
 
     def _run(self, shard: Shard, lease: Lease) -> None:
-        """Run a shard and write its result, or what went wrong."""
-        tick = time.monotonic()
+        """Run a shard, and write its result or why it failed."""
+        started = time.monotonic()
         try:
             result = self._train_and_evaluate(shard, lease)
             lease.check()
-            result.seconds["wall"] = time.monotonic() - tick
+            result.seconds["wall"] = time.monotonic() - started
             result.write(self.folder.result(shard))
             self._checkpoints(shard).remove()
             self.log.event("done", shard=shard.number, agents=shard.agents, seconds=result.seconds)
         except LeaseLostError as error:
             self.log.event("lost", shard=shard.number, error=str(error))
-            return  # the lease is somebody else's now
-        except (OSError, MemoryError) as error:  # a fault of this machine: another one may do better
+            return  # another worker holds the lease now
+        except (OSError, MemoryError) as error:  # not the shard's fault: another machine may succeed
             self.log.event("stopped", shard=shard.number, error=str(error))
             lease.release()
             reason = getattr(error, "strerror", None) or error
             raise StudyError(
                 f"{self.folder.shard_folder(shard)}: cannot be written: {reason}; earlier checkpoints are intact; when "
-                f"there is room, go on with: uavmec resume {self.folder.path}"
+                f"there is space, resume with: uavmec resume {self.folder.path}"
             ) from error
         except Exception as error:
             facts = {"error": f"{type(error).__name__}: {error}", "traceback": traceback.format_exc()}
@@ -132,7 +133,7 @@ class Worker:
             self.on_progress(self._progress(shard, shard.agents, float("nan")))
             return result
         checkpoints = self._checkpoints(shard)
-        training = checkpoints.resume(lambda: _started(self.runner, shard))
+        training = checkpoints.resume(lambda: _start(self.runner, shard))
         try:
             self.stop.check()
             for _ in training.run():
@@ -183,7 +184,7 @@ class Worker:
         )
 
 
-def _started(runner: ShardRunner, shard: Shard) -> Training:
+def _start(runner: ShardRunner, shard: Shard) -> Training:
     training = runner.start(shard)
     assert training is not None
     return training
@@ -200,7 +201,7 @@ def make_worker(
     """Make a worker for the run in a folder.
 
     Raises:
-        StudyError: there is none, or its plan is damaged.
+        StudyError: the folder holds no run, or the run plan is damaged.
     """
     folder = RunFolder.open(path)
     return Worker(

@@ -12,23 +12,25 @@ from uavmec_jax.scenarios.policies import TrainedPolicy, load_policy
 def advise_on(
     scenario: NamedScenario, policy: str | Path, *, samples: int, what_if: bool, seed: int = 0
 ) -> tuple[Advice, list[str]]:
-    """Recommend the next visit, and warn of everything in which the scenario is unlike the policy's training.
+    """Recommend the next visit, and warn where the scenario lies outside the policy's training distribution.
 
     Args:
         scenario: the devices and their present state.
-        policy: by name or from a file.
-        samples: futures simulated for each candidate.
-        what_if: whether to try every repair and removal too.
-        seed: of the futures.
+        policy: name of a policy, or its file.
+        samples: number of futures simulated for each candidate.
+        what_if: whether to evaluate every repair and removal of a device too.
+        seed: seed of the futures.
 
     Raises:
-        PolicyError: no such policy, or one for another number of devices.
+        PolicyError: there is no such policy, or it was trained for another number of devices.
     """
-    chosen = load_policy(policy)
-    unlike = chosen.out_of_distribution(scenario.params, scenario.layout) if isinstance(chosen, TrainedPolicy) else []
-    warnings = [f"{scenario.name}: {line}: {policy} may do worse here" for line in unlike]
+    loaded = load_policy(policy)
+    warnings = []
+    if isinstance(loaded, TrainedPolicy):
+        differences = loaded.out_of_distribution(scenario.params, scenario.layout)
+        warnings = [f"{scenario.name}: {difference}: {policy} may do worse here" for difference in differences]
     advice = advise(
-        chosen,
+        loaded,
         scenario.params,
         scenario.layout,
         scenario.state,

@@ -16,12 +16,12 @@ from uavmec_jax.env.rewards import Reward
 from uavmec_jax.files.validation import from_array, model_from_dataclasses
 from uavmec_jax.traffic.evacuation import load_evacuation
 
-_Declared: Any = model_from_dataclasses(
-    "Declared", ScenarioDistribution, leave_out=("params", "reward", "traffic_weights")
+_DistributionSettings: Any = model_from_dataclasses(
+    "DistributionSettings", ScenarioDistribution, leave_out=("params", "reward", "traffic_weights")
 )
 
 
-class ScenarioSettings(_Declared):
+class ScenarioSettings(_DistributionSettings):
     """The table ``scenarios`` of a study file; see :class:`ScenarioDistribution`."""
 
     places: Annotated[tuple[str, ...], Field(min_length=1), from_array] = ("albany", "round_lake")
@@ -29,14 +29,17 @@ class ScenarioSettings(_Declared):
 
 
 _FACTORS = ("region_m", "battery_factor", "hardware_factor", "uav_factor")
+"""Ranges of positive numbers."""
+
 _SHARES = ("powered", "connected")
+"""Ranges of numbers from 0 to 1."""
 
 
-def check_scenarios(scenarios: Any, n_devices: int) -> None:
-    """Refuse ranges that are none, and more devices than a layout holds.
+def check_scenarios(scenarios: ScenarioSettings, n_devices: int) -> None:
+    """Check that every range is one, and that layouts of ``n_devices`` entries are large enough.
 
     Raises:
-        ValueError: one line, the setting named.
+        ValueError: one line that names the setting.
     """
     for name in ("devices", *_SHARES, *_FACTORS, "traffic_price"):
         low, high = getattr(scenarios, name)
@@ -53,76 +56,76 @@ def check_scenarios(scenarios: Any, n_devices: int) -> None:
         raise ValueError(f"scenarios.typical_least is {scenarios.typical_least}; typical_devices is the most")
 
 
-def make_distribution(scenarios: Any, params: Params, reward: Reward, agents: int) -> ScenarioDistribution:
-    """The distribution of a study for ``agents`` agents, leaves ``[A, ...]``.
+def make_distribution(scenarios: ScenarioSettings, params: Params, reward: Reward, agents: int) -> ScenarioDistribution:
+    """Make the distribution that a study's agents draw from, leaves ``[A, ...]``.
 
     Args:
-        scenarios: the study's settings.
+        scenarios: settings of the study.
         params: leaves ``[A]``.
         reward: leaves ``[A, ...]``.
-        agents: how many.
+        agents: number of agents ``A``.
 
     Raises:
         TrafficError: a place is not usable.
     """
     weights = np.concatenate([load_evacuation(place).weight for place in scenarios.places])
-    plain = scenarios.model_dump(exclude={"places"}) | {"traffic_weights": weights}
-    spread = jax.tree.map(
-        lambda value: jnp.broadcast_to(jnp.asarray(value, jnp.float32), (agents, *np.shape(value))), plain
+    settings = scenarios.model_dump(exclude={"places"}) | {"traffic_weights": weights}
+    leaves = jax.tree.map(
+        lambda value: jnp.broadcast_to(jnp.asarray(value, jnp.float32), (agents, *np.shape(value))), settings
     )
-    return ScenarioDistribution(params=params, reward=reward, **spread)
+    return ScenarioDistribution(params=params, reward=reward, **leaves)
 
 
 def out_of_distribution(
     scenarios: Mapping[str, Any], trained: Mapping[str, Any], params: Params, layout: Layout
 ) -> list[str]:
-    """Compare a scenario with a distribution: a line for each quantity that lies outside.
+    """Compare a scenario with a training distribution and describe each quantity that lies outside, one line each.
 
     Args:
-        scenarios: the settings of the distribution, as plain data.
-        trained: the scenario parameters that were not drawn, as plain data.
-        params: of the scenario.
-        layout: of the scenario.
+        scenarios: settings of the distribution, as in a study file.
+        trained: scenario parameters of the training, by name.
+        params: parameters of the scenario.
+        layout: devices of the scenario.
     """
-    found = [
-        f"{name}: {_span(values)}; it was trained on {_span(known)}"
-        for name, (values, known) in _measured(scenarios, trained, params, layout).items()
-        if np.min(values) < known[0] * (1 - 1e-6) or np.max(values) > known[1] * (1 + 1e-6)
+    outside = [
+        f"{name}: {_span(values)}; it was trained on {_span(bounds)}"
+        for name, (values, bounds) in _drawn_quantities(scenarios, trained, params, layout).items()
+        if np.min(values) < bounds[0] * (1 - 1e-6) or np.max(values) > bounds[1] * (1 + 1e-6)
     ]
-    same = {name: getattr(params, name) for name in trained if name not in _DRAWN}
-    return found + [
+    constant = {name: getattr(params, name) for name in trained if name not in _NOT_CONSTANT}
+    return outside + [
         f"{name}: {value}; it was trained on {trained[name]}"
-        for name, value in same.items()
+        for name, value in constant.items()
         if not np.allclose(np.asarray(value, float), np.asarray(trained[name], float), rtol=1e-5)
     ]
 
 
-def _measured(
+_NOT_CONSTANT = ("n_devices", "region_m", "device_battery_range_j", "uav_battery_j", "uav_speed_m_s", "max_slots")
+"""Parameters that a distribution draws, that the layout replaces, or that do not matter to a policy."""
+
+
+def _drawn_quantities(
     scenarios: Mapping[str, Any], trained: Mapping[str, Any], params: Params, layout: Layout
 ) -> dict[str, tuple[Any, tuple[float, float]]]:
-    """Each quantity that is drawn, with the range it was drawn from."""
+    """Return each quantity that a distribution draws: its values in the scenario, and the range they were drawn from."""
     low, high = (trained["device_battery_range_j"][side] * scenarios["battery_factor"][side] for side in (0, 1))
-    own, factors = jax.tree.map(np.asarray, layout), scenarios["hardware_factor"]
-    extent = float(np.max(np.ptp(np.concatenate([own.position, np.zeros((1, 2))]), axis=0)))
-    within = lambda table: (table.min() * factors[0], table.max() * factors[1])  # noqa: E731
-    of_uav = lambda name: tuple(trained[name] * factor for factor in scenarios["uav_factor"])  # noqa: E731
+    devices, factors = jax.tree.map(np.asarray, layout), scenarios["hardware_factor"]
+    extent = float(np.max(np.ptp(np.concatenate([devices.position, np.zeros((1, 2))]), axis=0)))
+    hardware_range = lambda table: (table.min() * factors[0], table.max() * factors[1])  # noqa: E731
+    uav_range = lambda name: tuple(trained[name] * factor for factor in scenarios["uav_factor"])  # noqa: E731
     return {
-        "devices": (len(own.capacity), tuple(scenarios["devices"])),
+        "devices": (len(devices.capacity), tuple(scenarios["devices"])),
         "extent in m": (extent, (0.0, max(scenarios["region_m"][1], *trained["region_m"]))),
-        "battery capacities in J": (own.capacity, (low, high)),
-        "standby powers in W": (own.standby_power, within(hardware.STANDBY_POWER_W)),
-        "active powers in W": (own.active_power, within(hardware.ACTIVE_POWER_W)),
-        "processing rates in bytes/s": (own.processing_rate, within(hardware.PROCESSING_RATE_BYTES_S)),
-        "the UAV's battery in J": (params.uav_battery_j, of_uav("uav_battery_j")),
-        "the UAV's speed in m/s": (params.uav_speed_m_s, of_uav("uav_speed_m_s")),
+        "battery capacities in J": (devices.capacity, (low, high)),
+        "standby powers in W": (devices.standby_power, hardware_range(hardware.STANDBY_POWER_W)),
+        "active powers in W": (devices.active_power, hardware_range(hardware.ACTIVE_POWER_W)),
+        "processing rates in bytes/s": (devices.processing_rate, hardware_range(hardware.PROCESSING_RATE_BYTES_S)),
+        "the UAV's battery in J": (params.uav_battery_j, uav_range("uav_battery_j")),
+        "the UAV's speed in m/s": (params.uav_speed_m_s, uav_range("uav_speed_m_s")),
     }
 
 
-_DRAWN = ("n_devices", "region_m", "device_battery_range_j", "uav_battery_j", "uav_speed_m_s", "max_slots")
-"""Parameters that a distribution draws, that a layout overrides, or that do not matter."""
-
-
 def _span(values: Any) -> str:
-    """One number, or a range."""
+    """Format numbers as their only value, or as the range that they span."""
     low, high = float(np.min(values)), float(np.max(values))
     return f"{low:,.6g}" if low == high else f"{low:,.6g} to {high:,.6g}"

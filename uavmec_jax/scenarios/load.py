@@ -1,4 +1,4 @@
-"""Load the scenario to plan for: from a file, or the random one that a seed stands for in every study."""
+"""Load a scenario: from a file, or the random one that a seed stands for in every study."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -31,16 +31,16 @@ def load_scenario(
     """Load a scenario.
 
     Args:
-        file: a scenario file, TOML or CSV; ``None`` for the random scenario of ``seed``.
-        state: a state file, JSON: where the network stands now.
-        place: a simulated evacuation whose devices' positions the random scenario has.
-        powered: devices with grid power, of a random scenario.
-        connected: devices with communication, of a random scenario.
-        seed: of the random scenario, and of the volume draws.
+        file: scenario file, TOML or CSV; ``None`` for a random scenario.
+        state: state file, JSON, with the present state of the network; ``None`` for the initial state.
+        place: simulated evacuation, by name or file, that gives the devices of a random scenario their positions and traffic.
+        powered: number of devices with grid power in a random scenario.
+        connected: number of devices with communication in a random scenario.
+        seed: seed of the random scenario and of the volume draws.
         settings: scenario parameters to change, by name.
 
     Raises:
-        ScenarioError: the file is not usable, or a number does not fit.
+        ScenarioError: the file is not usable, or a number is out of range.
         StateError: the state does not fit the scenario.
         TrafficError: the place is not usable, or a hop in it would take longer than a slot may.
     """
@@ -49,13 +49,14 @@ def load_scenario(
     if file is not None:
         scenario = replace(load_scenario_file(file, settings), draw_id=(seed, 0, 0))
     else:
-        scenario = _random_scenario(_params(settings or {}), place, powered, connected, seed)
+        scenario = _random_scenario(_make_params(settings or {}), place, powered, connected, seed)
     return scenario if state is None else replace(scenario, state=load_state(state, scenario))
 
 
 def _random_scenario(
     params: Params, place: str | Path | None, powered: int, connected: int, seed: int
 ) -> NamedScenario:
+    """Return the scenario that studies train agents of this seed and these counts on."""
     evacuation = None if place is None else load_evacuation(place)
     if evacuation is not None:
         params = replace(params, n_devices=evacuation.n_devices, region_m=evacuation.region_m())
@@ -64,17 +65,16 @@ def _random_scenario(
         if not 0 <= count <= params.n_devices:
             raise ScenarioError(f"{name} is {count}; give 0 to {params.n_devices}, the number of devices")
     layout = layout_for_seed(seed, params, powered, connected)
-    name = f"{powered} powered, {connected} connected, seed {seed}"
-    if evacuation is None:
-        named = name_scenario(layout, params, name)
-    else:
+    name, device_names = f"{powered} powered, {connected} connected, seed {seed}", None
+    if evacuation is not None:
         layout = on_place(layout, evacuation)
-        named = name_scenario(layout, params, f"{evacuation.name}, {name}", evacuation.meta["names"])
-        named = replace(named, layout=replace(named.layout, traffic=layout.traffic))
-    return replace(named, draw_id=(seed, powered, connected))
+        name, device_names = f"{evacuation.name}, {name}", evacuation.meta["names"]
+    named = name_scenario(layout, params, name, device_names)
+    return replace(named, layout=replace(named.layout, traffic=layout.traffic), draw_id=(seed, powered, connected))
 
 
-def _params(settings: dict[str, Any]) -> Params:
+def _make_params(settings: dict[str, Any]) -> Params:
+    """Return Table 1 with some parameters changed."""
     try:
         checked = ParamsSettings.model_validate(settings)
         check_ranges(checked, "")

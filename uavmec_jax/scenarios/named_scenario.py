@@ -1,4 +1,4 @@
-"""Named scenarios: a user's own devices, with names, a place on the map and their present state."""
+"""Named scenarios: a user's devices with their names, their origin on the map and their present state."""
 
 import itertools
 import math
@@ -31,15 +31,16 @@ _HARDWARE_FIELDS = ("standby_power_w", "active_power_w", "processing_rate_bytes_
 
 @dataclass(frozen=True)
 class NamedScenario:
-    """A scenario to plan for.
+    """A scenario as its user knows it.
 
     Attributes:
-        file: what the scenario file says.
-        params: Table 1 with the file's changes; the region is what the devices span if they are geographic.
+        file: contents of the scenario file.
+        params: Table 1 with the file's changes; the region is the devices' extent where they have geographic coordinates
+            and the file gives no region.
         layout: the devices, in the order of the file.
-        state: the present state; the initial one unless a state file says otherwise.
-        origin: longitude and latitude of the corner where the UAV starts, if known.
-        draw_id: seed, powered and connected devices: what its volume draws depend on.
+        state: present state, by default the initial one.
+        origin: longitude and latitude of the corner where the UAV starts; ``None`` if unknown.
+        draw_id: seed and numbers of powered and connected devices, which the volume draws depend on.
     """
 
     file: ScenarioFile
@@ -59,8 +60,8 @@ class NamedScenario:
         """Names of the devices."""
         return [device.name for device in self.file.device]
 
-    def geographic(self, position: np.ndarray) -> Float[np.ndarray, "*n 2"]:
-        """Longitude and latitude ``[..., 2]`` of positions in metres.
+    def geographic(self, position: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+        """Convert positions ``[..., 2]`` in metres to longitudes and latitudes.
 
         Raises:
             ScenarioError: the scenario has no origin.
@@ -70,14 +71,14 @@ class NamedScenario:
         return np.asarray(position, float) / _metres_per_degree(self.origin[1]) + np.array(self.origin)
 
     def draws(self, count: int) -> Key[Array, " D"]:
-        """``[count]`` volume draws: of a random scenario those that studies hold out for it."""
+        """Return ``count`` volume draws; for a random scenario they are those on which studies evaluate policies."""
         return held_out_draws(*self.draw_id, count)
 
     def with_failure_price(self, price: float) -> "NamedScenario":
-        """The scenario with a price on the first failure, in slots of lifetime; see :class:`um.Traffic`.
+        """Return the scenario with a price on the first failure, in slots of lifetime; see :class:`um.Traffic`.
 
         Raises:
-            StateError: the price is not a finite number from 0, or the traffic of the devices is unknown.
+            StateError: the price is negative or not finite, or the traffic of the devices is unknown.
         """
         if not 0 <= price < np.inf:
             raise StateError(f"price is {price}; give slots, a finite number from 0")
@@ -88,16 +89,21 @@ class NamedScenario:
 
 
 def _metres_per_degree(latitude: float) -> Float[np.ndarray, "2"]:
-    """Metres per degree of longitude and of latitude (equirectangular, exact enough over a town)."""
+    """Return metres per degree of longitude and of latitude (equirectangular: exact enough within a city)."""
     per_degree = math.radians(1.0) * _EARTH_RADIUS_M
     return np.array([per_degree * math.cos(math.radians(latitude)), per_degree])
 
 
 def make_named_scenario(data: dict[str, Any], source: str, overrides: dict[str, Any] | None = None) -> NamedScenario:
-    """Check plain data as a scenario file holds it, and make the scenario; ``source`` names it in messages.
+    """Make a scenario from the data of a scenario file.
+
+    Args:
+        data: contents of the file, as parsed from TOML.
+        source: name of the file, for messages.
+        overrides: scenario parameters to change, by name.
 
     Raises:
-        ScenarioError: something does not fit; one line.
+        ScenarioError: a value is wrong; one line that names it.
     """
     if isinstance(data.get("params", {}), dict):
         data = data | {"params": data.get("params", {}) | (overrides or {})}
@@ -118,12 +124,13 @@ def _build(file: ScenarioFile) -> NamedScenario:
     _check_names(file)
     position, origin = _positions(file)
     params = _params(file, position)
-    _check_places(file, params, position)
+    _check_positions(file, params, position)
     layout = _layout(file, position)
     return NamedScenario(file, params, layout, initial_state(params, layout), origin)
 
 
 def _check_names(file: ScenarioFile) -> None:
+    """Check that no two devices have the same name."""
     seen: set[str] = set()
     for number, device in enumerate(file.device, 1):
         if device.name in seen:
@@ -131,8 +138,8 @@ def _check_names(file: ScenarioFile) -> None:
         seen.add(device.name)
 
 
-def _params(file: ScenarioFile, position: np.ndarray) -> Params:
-    """Table 1 with the file's changes."""
+def _params(file: ScenarioFile, position: Float[np.ndarray, "n 2"]) -> Params:
+    """Return Table 1 with the file's changes."""
     count, changed = len(file.device), file.params.model_fields_set
     if "n_devices" in changed and file.params.n_devices != count:
         raise ValueError(f"params.n_devices is {file.params.n_devices}, but there are {count} devices; leave it out")
@@ -142,7 +149,8 @@ def _params(file: ScenarioFile, position: np.ndarray) -> Params:
     return Params(n_devices=count, **settings)
 
 
-def _layout(file: ScenarioFile, position: np.ndarray) -> Layout:
+def _layout(file: ScenarioFile, position: Float[np.ndarray, "n 2"]) -> Layout:
+    """Return the devices as arrays."""
     powers = np.array([_hardware(number, device) for number, device in enumerate(file.device, 1)])
     return Layout(
         position=jnp.asarray(position, jnp.float32),
@@ -158,7 +166,7 @@ def _layout(file: ScenarioFile, position: np.ndarray) -> Layout:
 
 
 def _positions(file: ScenarioFile) -> tuple[Float[np.ndarray, "n 2"], tuple[float, float] | None]:
-    """Metres from the corner where the UAV starts, and that corner's longitude and latitude if known."""
+    """Return positions in metres from the corner where the UAV starts, and that corner's longitude and latitude if known."""
     metres = [device.x_m is not None and device.y_m is not None for device in file.device]
     degrees = [device.lon is not None and device.lat is not None for device in file.device]
     for number, (device, in_metres, in_degrees) in enumerate(zip(file.device, metres, degrees, strict=True), 1):
@@ -168,22 +176,22 @@ def _positions(file: ScenarioFile) -> tuple[Float[np.ndarray, "n 2"], tuple[floa
             )
     if not degrees[0]:
         return np.array([[device.x_m, device.y_m] for device in file.device], float), file.origin
-    places = np.array([[device.lon, device.lat] for device in file.device], float)
-    west, south = file.origin or (float(places[:, 0].min()), float(places[:, 1].min()))
-    return (places - [west, south]) * _metres_per_degree(south), (west, south)
+    coordinates = np.array([[device.lon, device.lat] for device in file.device], float)
+    west, south = file.origin or (float(coordinates[:, 0].min()), float(coordinates[:, 1].min()))
+    return (coordinates - [west, south]) * _metres_per_degree(south), (west, south)
 
 
-def _check_places(file: ScenarioFile, params: Params, position: np.ndarray) -> None:
-    """Check that all devices are inside the region, and that one charge of the UAV is enough for any hop."""
-    for number, (device, place) in enumerate(zip(file.device, position, strict=True), 1):
-        if np.any(place < 0) or np.any(place > np.array(params.region_m) * (1 + 1e-6)):
+def _check_positions(file: ScenarioFile, params: Params, position: Float[np.ndarray, "n 2"]) -> None:
+    """Check that all devices are inside the region, and that the UAV's battery is large enough for any hop."""
+    for number, (device, (x, y)) in enumerate(zip(file.device, position, strict=True), 1):
+        if min(x, y) < 0 or np.any(np.array([x, y]) > np.array(params.region_m) * (1 + 1e-6)):
             raise ValueError(
-                f"device {number} ({device.name}): lies at {place[0]:.0f}, {place[1]:.0f} m, outside the region of "
+                f"device {number} ({device.name}): lies at {x:.0f}, {y:.0f} m, outside the region of "
                 f"{params.region_m[0]:g} x {params.region_m[1]:g} m; move it or give a larger params.region_m"
             )
-    stops = [("the start", np.zeros(2)), *((d.name, p) for d, p in zip(file.device, position, strict=True))]
-    for (here, a), (there, b) in itertools.combinations(stops, 2):
-        metres = float(np.linalg.norm(a - b))
+    stops = [("the start", np.zeros(2)), *zip([device.name for device in file.device], position, strict=True)]
+    for (here, start), (there, end) in itertools.combinations(stops, 2):
+        metres = float(np.linalg.norm(start - end))
         energy = params.uav_flying_power_w * metres / params.uav_speed_m_s
         if energy > params.uav_battery_j:
             raise ValueError(
@@ -193,19 +201,21 @@ def _check_places(file: ScenarioFile, params: Params, position: np.ndarray) -> N
 
 
 def _index(name: str | None, names: tuple[str, ...]) -> int:
+    """Return the index of a name in the paper's tables."""
     return names.index(name) if name in names else UNLISTED
 
 
 def _hardware(number: int, device: Device) -> tuple[float, float, float]:
-    """Standby power, active power and processing rate: the device's own, else those of the tables."""
-    own = [getattr(device, field) for field in _HARDWARE_FIELDS]
-    where = f"device {number} ({device.name})"
+    """Return standby power, active power and processing rate: the given ones, else those of the paper's tables."""
+    given = [getattr(device, field) for field in _HARDWARE_FIELDS]
     for field, names in (("type", hardware.DEVICE_TYPES), ("task", hardware.TASKS)):
-        given = getattr(device, field)
-        needed = own[:1] if field == "type" else own[1:]
-        if given not in names and (None in own[1:] or None in needed):
-            hint = f"is {given!r}, which the tables do not list; {suggest(given, names)}" if given else "is missing"
-            raise ValueError(f"{where}: {field} {hint}; or give {', '.join(_HARDWARE_FIELDS)}")
+        name = getattr(device, field)
+        needed = given if field == "type" else given[1:]  # the standby power depends on the type alone
+        if name not in names and None in needed:
+            problem = f"is {name!r}, which the tables do not list; {suggest(name, names)}" if name else "is missing"
+            raise ValueError(
+                f"device {number} ({device.name}): {field} {problem}; or give {', '.join(_HARDWARE_FIELDS)}"
+            )
     kind, task = _index(device.type, hardware.DEVICE_TYPES), _index(device.task, hardware.TASKS)
     listed = (
         hardware.STANDBY_POWER_W[kind],
@@ -213,7 +223,7 @@ def _hardware(number: int, device: Device) -> tuple[float, float, float]:
         hardware.PROCESSING_RATE_BYTES_S[task, kind],
     )
     standby, active, rate = (
-        float(mine if mine is not None else table) for mine, table in zip(own, listed, strict=True)
+        float(table if value is None else value) for value, table in zip(given, listed, strict=True)
     )
     return standby, active, rate
 
@@ -221,21 +231,22 @@ def _hardware(number: int, device: Device) -> tuple[float, float, float]:
 def name_scenario(
     layout: Layout, params: Params, name: str, device_names: Sequence[str] | None = None
 ) -> NamedScenario:
-    """Name a random layout; its devices are ``device 1``, ``device 2``, ... unless they have names."""
-    own = jax.tree.map(np.asarray, layout)
+    """Name a random scenario; its devices are ``device 1``, ``device 2``, ... unless ``device_names`` are given."""
+    names = device_names or [f"device {number}" for number in range(1, len(layout.capacity) + 1)]
     settings = {field: getattr(params, field) for field in ParamsSettings.model_fields if field != "n_devices"}
     changed = {field: value for field, value in settings.items() if value != getattr(Params(), field)}
+    arrays = jax.tree.map(np.asarray, layout)
     devices = [
         {
-            "name": device_names[i] if device_names else f"device {i + 1}",
-            "x_m": float(own.position[i, 0]),
-            "y_m": float(own.position[i, 1]),
-            "type": hardware.DEVICE_TYPES[own.device_type[i]],
-            "task": hardware.TASKS[own.task[i]],
-            "capacity_j": float(own.capacity[i]),
-            "power": bool(own.has_power[i]),
-            "comms": bool(own.has_comms[i]),
+            "name": device_name,
+            "x_m": float(arrays.position[i, 0]),
+            "y_m": float(arrays.position[i, 1]),
+            "type": hardware.DEVICE_TYPES[arrays.device_type[i]],
+            "task": hardware.TASKS[arrays.task[i]],
+            "capacity_j": float(arrays.capacity[i]),
+            "power": bool(arrays.has_power[i]),
+            "comms": bool(arrays.has_comms[i]),
         }
-        for i in range(len(own.capacity))
+        for i, device_name in enumerate(names)
     ]
     return make_named_scenario({"name": name, "params": changed, "device": devices}, name)

@@ -1,9 +1,10 @@
-"""Layouts on a place: positions of a simulated evacuation, and the traffic that its devices see."""
+"""Layouts in a place: the devices' positions in a simulated evacuation and the traffic around them."""
 
 from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from uavmec_jax.env.layout import Layout, Traffic
 from uavmec_jax.traffic.evacuation import Evacuation
@@ -12,12 +13,12 @@ from uavmec_jax.traffic.evacuation import Evacuation
 def on_place(
     layout: Layout, evacuation: Evacuation, *, moving: bool = False, scale_to_m: float | None = None
 ) -> Layout:
-    """Place the devices of a layout where those of an evacuation stand.
+    """Return a layout whose devices have the positions and the traffic of an evacuation.
 
     Args:
         layout: hardware, batteries, power and communication of ``n`` devices.
-        evacuation: of ``n`` devices.
-        moving: their weights follow the evacuation's windows; by default they are its mean, as in the paper.
+        evacuation: a simulated evacuation with ``n`` devices.
+        moving: whether the traffic weights follow the evacuation's windows; by default they are its mean, as in the paper.
         scale_to_m: see :meth:`Evacuation.local_position`.
     """
     traffic = Traffic(
@@ -29,6 +30,6 @@ def on_place(
     return replace(layout, position=position, traffic=traffic)
 
 
-def traffic_weights(evacuation: Evacuation, moving: bool) -> np.ndarray:
-    """Weights ``[W, n]`` of every window of an evacuation, or ``[1, n]``, their mean."""
+def traffic_weights(evacuation: Evacuation, moving: bool) -> Float[np.ndarray, "W n"]:
+    """Return the traffic weights of every window of an evacuation, or their mean as its only window."""
     return evacuation.window_weight if moving else evacuation.weight[None]

@@ -1,4 +1,4 @@
-"""Policies by name or from files: heuristics, planners, and what was trained."""
+"""Load policies by name or from files: heuristics, planners and trained agents."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -33,18 +33,18 @@ from uavmec_jax.scenarios.policy_files import (
 )
 
 _SHIPPED = resources.files("uavmec_jax.scenarios") / "library"
-"""The policies that ship with the package."""
+"""Folder of the policies that ship with the package."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrainedPolicy:
-    """The greedy policy of one trained agent; it makes its own observation and is called like every policy.
+    """The greedy policy of one trained agent, with its observation function: it is called like every other policy.
 
     Attributes:
-        algorithm: name of what trained it.
-        trained_on: its value on every axis of the study: seed, powered and connected devices, ...
-        n_devices: number of devices, fixed by the network; ``None`` where it plays any number.
-        collection: the file's contents, of this agent alone.
+        algorithm: name of the algorithm that trained it.
+        trained_on: the agent's value on every axis of its study: seed, powered, connected, ...
+        n_devices: number of devices that the network takes; ``None`` if it takes any number.
+        collection: contents of the agent's policy file.
     """
 
     algorithm: str
@@ -59,6 +59,12 @@ class TrainedPolicy:
     def of(cls, collection: PolicyCollection, name: str, index: int, which: str) -> "TrainedPolicy":
         """Make the policy of one agent of a collection.
 
+        Args:
+            collection: policies of trained agents.
+            name: algorithm of the agent.
+            index: position of the agent among those of its algorithm.
+            which: ``"best"`` or ``"last"`` weights.
+
         Raises:
             PolicyError: there are no such weights, or they are not finite.
         """
@@ -71,8 +77,8 @@ class TrainedPolicy:
         axes = alone.agents[name][0]
         algorithm, hyper = alone.algorithm(name), alone.hyper(name, axes)
         value_fn = None
-        if (value_of := algorithm.value_fn) is not None:
-            value_fn = jax.jit(lambda *at: value_of(hyper, weights, algorithm.observation_fn(*at)))
+        if (network_value := algorithm.value_fn) is not None:
+            value_fn = jax.jit(lambda *state: network_value(hyper, weights, algorithm.observation_fn(*state)))
         return cls(
             algorithm=name,
             trained_on=axes,
@@ -84,7 +90,7 @@ class TrainedPolicy:
         )
 
     def __call__(self, params: Params, layout: Layout, state: State, key: Any = None) -> Int[Array, "*batch"]:
-        """Return the device to visit, int32, in states with any batch axes in front.
+        """Return the device to visit, int32; the state may have any number of batch axes in front.
 
         Raises:
             PolicyError: the layout has another number of devices.
@@ -97,31 +103,31 @@ class TrainedPolicy:
         return action
 
     def act(self, observation: Any) -> Int[np.ndarray, "*batch"]:
-        """Return the device to visit for observations ``[..., obs_size]``: NumPy in, NumPy int32 ``[...]`` out.
+        """Return the device to visit, int32, for observations ``[..., obs_size]``.
 
         Args:
-            observation: the paper's, ``2n`` numbers; of a policy that plays any number of devices the full one: for each
-                device its features and a 1 behind them.
+            observation: the paper's observation, ``2n`` numbers; for a policy that takes any number of devices, the full
+                one: for each device its features and a 1 behind them.
 
         Raises:
-            PolicyError: the observation has another shape, or holds something other than numbers.
+            PolicyError: the observation has another shape, or is not an array of numbers.
         """
         try:
-            given = np.asarray(observation, np.float32)
+            array = np.asarray(observation, np.float32)
         except (TypeError, ValueError) as error:
             raise PolicyError(f"the observation is not an array of numbers: {error}") from None
         size = 2 * self.n_devices if self.n_devices else len(FEATURES) + 1
-        last = given.shape[-1] if given.ndim else 0
+        last = array.shape[-1] if array.ndim else 0
         if last != size and (self.n_devices or last == 0 or last % size):
             shapes = f"({size},) or (..., {size})" if self.n_devices else f"(..., {size} for each device)"
-            raise PolicyError(f"the observation has the shape {given.shape}; it should be {shapes}")
-        return np.asarray(self._greedy(given))
+            raise PolicyError(f"the observation has the shape {array.shape}; it should be {shapes}")
+        return np.asarray(self._greedy(array))
 
     def value(self, params: Params, layout: Layout, states: State) -> Float[Array, " B"]:
-        """Estimate the rest of the return in states with one batch axis.
+        """Estimate the return from states with one batch axis on.
 
         Raises:
-            PolicyError: it was trained without a value network.
+            PolicyError: the algorithm has no value network.
         """
         if self._value_fn is None:
             raise PolicyError(f"{self.algorithm} has no value network; PPO and A2C have one")
@@ -129,15 +135,15 @@ class TrainedPolicy:
         return value
 
     def out_of_distribution(self, params: Params, layout: Layout) -> list[str]:
-        """Compare a scenario with those that the policy was trained on: a line for each quantity outside.
+        """Describe each quantity of a scenario that lies outside the policy's training distribution, one line each.
 
-        The list is empty for a policy that was trained on one scenario only.
+        Return an empty list for a policy that was trained on one scenario only.
         """
         drawn = self.collection.drawn
         return out_of_distribution(drawn["scenarios"], drawn["params"], params, layout) if drawn else []
 
     def save(self, path: str | Path) -> None:
-        """Write the policy to a file of its own (``.npz``), whole or not at all."""
+        """Write the policy to a file of its own (``.npz``), atomically."""
         write_policies(Path(path), self.collection)
 
 
@@ -146,16 +152,16 @@ def load_policy(source: str | Path, which: str = "best", **axes: Any) -> Policy:
 
     Args:
         source: ``"generalist"``, a name in :data:`HEURISTICS`, ``"rollout"``, a policy file, or the folder of a run.
-        which: ``"best"`` or ``"last"`` weights of a run's agent; a policy file has one kind.
-        axes: which agent of a run, e.g. ``powered=8, connected=8, seed=3, algorithm="ppo"``; axes on which all agents have
-            the same value may be left out.
+        which: ``"best"`` or ``"last"`` weights of a run's agent; a policy file has only one of the two.
+        axes: values that select one agent of a run, e.g. ``powered=8, connected=8, seed=3, algorithm="ppo"``; axes on
+            which all agents have the same value may be left out.
 
     Returns:
         ``policy(params, layout, state, key=None) -> action``; a :class:`TrainedPolicy` if it was trained.
 
     Raises:
-        PolicyError: no policy of that name; a file that is damaged, altered or from another version; weights that are not
-            finite; or no agent, or several, on those axes.
+        PolicyError: there is no such policy; its file is damaged, altered or from another version; its weights are not
+            finite; or no agent, or more than one, has the given values.
     """
     if str(source) in HEURISTICS:
         return HEURISTICS[str(source)]
@@ -170,15 +176,17 @@ def load_policy(source: str | Path, which: str = "best", **axes: Any) -> Policy:
         raise PolicyError(f"{source}: neither a file nor a policy by name; {hint}")
     collection = read_policies(path)
     kinds = {key.split("/")[1] for key in collection.weights}
+    if len(kinds) == 1:
+        (which,) = kinds
     try:
         name, index = collection.pick(axes)
-        return TrainedPolicy.of(collection, name, index, next(iter(kinds)) if len(kinds) == 1 else which)
+        return TrainedPolicy.of(collection, name, index, which)
     except PolicyError as error:
         raise PolicyError(f"{path}: {error}") from None
 
 
 def draws_scenarios(directory: Path) -> bool:
-    """Whether the agents of a run drew a fresh scenario in every episode, so that none belongs to one of them.
+    """Return whether the agents of a run drew a fresh scenario in every episode, instead of having one each.
 
     Raises:
         PolicyError: the folder holds no weights, or they are damaged.

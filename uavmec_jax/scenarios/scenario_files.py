@@ -1,4 +1,4 @@
-"""Scenario files: named scenarios in TOML or CSV, read and written."""
+"""Read and write scenario files: named scenarios in TOML or CSV."""
 
 import csv
 import io
@@ -14,14 +14,14 @@ from uavmec_jax.scenarios.schema import Device
 
 
 def load_scenario_file(path: str | Path, overrides: dict[str, Any] | None = None) -> NamedScenario:
-    """Read a scenario file: ``.toml``, or ``.csv`` with the same column names.
+    """Read a scenario file: ``.toml``, or ``.csv`` whose columns have the names of a device's settings.
 
     Args:
         path: the file.
-        overrides: scenario parameters by name, e.g. ``{"region_m": (2000.0, 2000.0)}``.
+        overrides: scenario parameters to change, by name, e.g. ``{"region_m": (2000.0, 2000.0)}``.
 
     Raises:
-        ScenarioError: the file is missing or holds something that does not fit; one line.
+        ScenarioError: the file is missing or a value in it is wrong; one line.
     """
     path = Path(path)
     if path.suffix.lower() not in (".toml", ".csv"):
@@ -33,12 +33,12 @@ def load_scenario_file(path: str | Path, overrides: dict[str, Any] | None = None
 
 
 def _from_csv(text: str) -> dict[str, Any]:
-    """Convert cells to numbers and truth values where possible; the checks report the others."""
-    words = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
+    """Convert cells to numbers and booleans where possible; validation reports the others."""
+    booleans = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
 
-    def cell(column: str, value: Any) -> Any:
+    def convert(column: str, value: Any) -> Any:
         if column in ("power", "comms"):
-            return words.get(value.lower(), value)
+            return booleans.get(value.lower(), value)
         if column in ("name", "type", "task"):
             return value
         try:
@@ -47,14 +47,14 @@ def _from_csv(text: str) -> dict[str, Any]:
             return value
 
     rows = csv.DictReader(io.StringIO(text), skipinitialspace=True, restkey="more cells than columns", restval="")
-    return {"device": [{k: cell(k, v) for k, v in row.items() if v != ""} for row in rows]}
+    return {"device": [{k: convert(k, v) for k, v in row.items() if v != ""} for row in rows]}
 
 
 def scenario_text(scenario: NamedScenario, suffix: str = ".toml") -> str:
-    """Write a scenario as the text of a file, ``.toml`` or ``.csv``, that reads back to an equal one.
+    """Return the text of a scenario file, ``.toml`` or ``.csv``, from which an equal scenario is read back.
 
     Raises:
-        ScenarioError: a CSV was asked for, which has no place for parameters or an origin.
+        ScenarioError: a CSV was asked for, which cannot hold the scenario's parameters or origin.
     """
     file = scenario.file
     devices = [device.model_dump(exclude_none=True) for device in file.device]

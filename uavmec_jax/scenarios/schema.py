@@ -1,4 +1,4 @@
-"""What a scenario file may hold."""
+"""The schema of scenario files."""
 
 from typing import Annotated
 
@@ -13,7 +13,7 @@ _Latitude = Annotated[float, Field(ge=-89, le=89)]
 
 
 class Device(StrictModel):
-    """One device: units in the names; either ``x_m, y_m`` or ``lon, lat``."""
+    """One device; its position is either ``x_m, y_m`` or ``lon, lat``. Units are in the names."""
 
     name: Annotated[str, Field(min_length=1, max_length=80)]
     x_m: float | None = None
@@ -21,7 +21,7 @@ class Device(StrictModel):
     lon: _Longitude | None = None
     lat: _Latitude | None = None
     type: str | None = None
-    """A name in :data:`hardware.DEVICE_TYPES`; any other needs the three numbers below."""
+    """A name in :data:`hardware.DEVICE_TYPES`; any other needs the three numbers below ``task``."""
     task: str | None = None
     """A name in :data:`hardware.TASKS`."""
     standby_power_w: _Power | None = None
@@ -33,10 +33,10 @@ class Device(StrictModel):
 
 
 class ScenarioFile(StrictModel):
-    """A scenario file."""
+    """Contents of a scenario file."""
 
     name: str = ""
     origin: Annotated[tuple[_Longitude, _Latitude] | None, from_array] = None
-    """Longitude and latitude of the corner x_m = y_m = 0."""
+    """Longitude and latitude of the corner ``x_m = y_m = 0``."""
     params: ParamsSettings = ParamsSettings()
     device: Annotated[tuple[Device, ...], from_array] = ()

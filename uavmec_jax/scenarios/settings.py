@@ -1,4 +1,4 @@
-"""Scenario parameters in files: the checked form of :class:`Params`."""
+"""Scenario parameters in files: :class:`Params` as a validated model."""
 
 from typing import Any
 
@@ -9,10 +9,14 @@ ParamsSettings: Any = model_from_dataclasses("ParamsSettings", Params)
 
 
 def check_ranges(settings: Any, where: str) -> None:
-    """Refuse ranges that are none; ``where`` stands before the name in the message.
+    """Check that the lower end of every range of scenario parameters is positive and not above its upper end.
+
+    Args:
+        settings: scenario parameters.
+        where: prefix of a parameter's name in messages.
 
     Raises:
-        ValueError: one line.
+        ValueError: one line that names the parameter.
     """
     for name in ("device_battery_range_j", "task_volume_range_bytes"):
         low, high = getattr(settings, name)

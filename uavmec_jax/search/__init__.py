@@ -1,4 +1,4 @@
-"""Hyperparameter search: Optuna proposes trials in batches, each batch is one population with successive halving."""
+"""Hyperparameter search: Optuna proposes batches of trials; each batch is a population under successive halving."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""What a search gained: the best settings against the study's own, on towns that the search has never seen."""
+"""Compare the best settings of a search with the study's own, on scenarios that the search has not seen."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -10,37 +10,39 @@ from uavmec_jax.studies.study import load_study
 from uavmec_jax.training.population import Progress
 
 OWN, BEST = "own", "best"
-"""Folders of the two runs, in that of the search."""
+"""Folders of the two runs, inside the folder of the search."""
 
 
 def confirm(
-    found: SearchResult,
+    result: SearchResult,
     directory: str | Path,
     *,
     command: str | None = None,
-    on_progress: Callable[[str, Progress], None] = lambda name, news: None,
+    on_progress: Callable[[str, Progress], None] = lambda name, progress: None,
 ) -> tuple[Side, Side]:
-    """Train the study with its own and with the best settings, on its own towns; or read what was trained before.
+    """Train the study with its own and with the best settings on its own scenarios, or load runs that exist.
 
     Args:
-        found: by the search.
-        directory: of the search; the runs are kept in ``own`` and ``best`` there.
-        command: the command line, for the labels.
-        on_progress: told ``(own or best, progress)``.
+        result: the result of the search.
+        directory: folder of the search; the runs are in its folders ``own`` and ``best``.
+        command: the command line, for the labels of the runs.
+        on_progress: called with the name of the run, ``own`` or ``best``, and its progress.
+
+    Returns:
+        The study with its own settings, and with the best ones.
 
     Raises:
-        KeyboardInterrupt: a signal came; what was trained is kept.
+        KeyboardInterrupt: a signal arrived; the runs can be resumed.
     """
-    space = found.space
-    seeds = {"axes.seeds": space.confirm_seeds}
-    own = load_study(space.study, space.change | seeds)
-    best = best_study(found)
+    space = result.space
+    baseline = load_study(space.study, space.change | {"axes.seeds": space.confirm_seeds})
+    best = best_study(result)
     best = best.model_copy(update={"axes": best.axes | {"seeds": space.confirm_seeds}})
     sides = []
-    for name, study in ((OWN, own), (BEST, best)):
+    for name, study in ((OWN, baseline), (BEST, best)):
 
-        def report(news: Progress, name: str = name) -> None:
-            on_progress(name, news)
+        def report(progress: Progress, name: str = name) -> None:
+            on_progress(name, progress)
 
         results = run_or_resume(study, Path(directory) / name, command=command, on_progress=report)
         if not results.run["complete"]:

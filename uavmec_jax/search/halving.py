@@ -1,4 +1,4 @@
-"""Successive halving within one batch: a population of trials x scenarios in which, rung after rung, only the best go on."""
+"""Successive halving of one batch of trials: a population of trials x scenarios, pruned at every rung."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int, Key
 
 from uavmec_jax.agents.algorithm import Agent, Algorithm
 from uavmec_jax.agents.registry import ALGORITHMS
@@ -32,16 +33,16 @@ from uavmec_jax.training.regroup import regroup
 from uavmec_jax.training.training import Trainer, Training, Validation
 
 Values = Mapping[str, Any]
-"""A trial: setting -> value."""
+"""The settings of a trial: name -> value."""
 
 
 @dataclass(frozen=True)
 class TrialOutcome:
-    """How a trial did.
+    """The outcome of a trial.
 
     Attributes:
-        value: of the objective; ``None`` if the trial was pruned.
-        rungs: environment step of one agent -> mean validation lifetime of the best weights by then.
+        value: its objective; ``None`` if the trial was pruned.
+        rungs: environment steps of one agent -> mean validation score of the best weights so far.
     """
 
     value: float | None
@@ -50,39 +51,41 @@ class TrialOutcome:
 
 @dataclass
 class SuccessiveHalving:
-    """Runs the batches of a search; programs are compiled once for each shape.
+    """Runs the batches of a search; programs are compiled once per shape.
 
     Attributes:
-        space: of the search.
-        on_progress: called with ``(share of the batch that is done, trials that are left)``.
+        space: the search space.
+        on_progress: called with ``(finished share of the batch, trials in training)``.
     """
 
     space: Space
-    on_progress: Callable[[float, int], None] = lambda share, left: None
+    on_progress: Callable[[float, int], None] = lambda share, trials: None
     _trainers: dict[Any, Trainer] = field(default_factory=dict)
 
     @cached_property
     def study(self) -> Study:
-        """The study on the search's own scenarios."""
-        base, own = self.space.base(), self.space.validation
-        cells = {"cells": [list(cell) for cell in own.cells]} if own.cells else {}
-        kept = {name: base.axes[name] for name in ("powered", "connected", "cells") if name in base.axes and not cells}
-        seeds = list(range(own.first_seed, own.first_seed + own.seeds))
-        evaluation = base.evaluation.model_copy(update={"draws": own.draws})
-        return base.model_copy(update={"axes": kept | cells | {"seeds": seeds}, "evaluation": evaluation})
+        """The study on the validation scenarios of the search."""
+        base, scenarios = self.space.base(), self.space.validation
+        if scenarios.cells:
+            axes: dict[str, Any] = {"cells": [list(cell) for cell in scenarios.cells]}
+        else:
+            axes = {name: base.axes[name] for name in ("powered", "connected", "cells") if name in base.axes}
+        seeds = list(range(scenarios.first_seed, scenarios.first_seed + scenarios.seeds))
+        evaluation = base.evaluation.model_copy(update={"draws": scenarios.draws})
+        return base.model_copy(update={"axes": axes | {"seeds": seeds}, "evaluation": evaluation})
 
     @cached_property
     def agent_ids(self) -> list[AgentId]:
-        """Identities of the agents of one trial: one on each scenario."""
+        """Identities of the agents of one trial, one per scenario."""
         return make_agent_ids(self.study)
 
     @property
     def n_scenarios(self) -> int:
-        """Agents of one trial."""
+        """Number of scenarios, and thus of agents of one trial."""
         return len(self.agent_ids)
 
     def run(self, trials: Sequence[Values]) -> list[TrialOutcome]:
-        """Train and evaluate a batch, whose static settings are the same for all trials.
+        """Train and evaluate a batch of trials that share their static settings.
 
         Raises:
             StudyError: the batch does not fit in memory.
@@ -93,24 +96,24 @@ class SuccessiveHalving:
         trainings = [
             trainer.start(*take_padded((agents, keys), shard * size, size)) for shard in range(trainer.partition.shards)
         ]
-        left = list(range(len(trials)))
+        remaining = list(range(len(trials)))
         rungs: list[dict[int, float]] = [{} for _ in trials]
         for chunk in self._rungs(trainer):
-            self._train_until(trainings, chunk, len(left))
-            scores = self._by_trial(np.concatenate([training.best_scores for training in trainings]), len(left))
-            for trial, score in zip(left, scores, strict=True):
+            self._train_until(trainings, chunk, len(remaining))
+            scores = self._trial_means(np.concatenate([training.best_scores for training in trainings]), len(remaining))
+            for trial, score in zip(remaining, scores, strict=True):
                 rungs[trial][trainings[0].steps] = float(score)
             if chunk < len(trainer.chunks):
-                n = max(1, round(self.space.halving.keep * len(left)))
+                n = max(1, round(self.space.halving.keep * len(remaining)))
                 best = np.sort(np.argsort(-scores, kind="stable")[:n])
-                left = [left[k] for k in best]
+                remaining = [remaining[k] for k in best]
                 trainings = regroup(trainings, self._members(best))
-        agents = jax.tree.map(lambda leaf: leaf[self._members(left)], agents)
-        values = dict(zip(left, self._objective(agents, trainings, algorithm), strict=True))
+        agents = jax.tree.map(lambda leaf: leaf[self._members(remaining)], agents)
+        values = dict(zip(remaining, self._objective(agents, trainings, algorithm), strict=True))
         return [TrialOutcome(values.get(k), rungs[k]) for k in range(len(trials))]
 
-    def _population(self, trials: Sequence[Values]) -> tuple[Agent, Any, Algorithm]:
-        """Trials x scenarios: agents, validation draws, and the algorithm of the batch."""
+    def _population(self, trials: Sequence[Values]) -> tuple[Agent, Key[Array, "A D"], Algorithm]:
+        """Make the population of a batch, trials x scenarios: its agents, validation draws and algorithm."""
         study = self._with_static(trials[0])
         agent_ids = self.agent_ids * len(trials)
         agents = make_agents(study, agent_ids=agent_ids)
@@ -131,28 +134,28 @@ class SuccessiveHalving:
         return agents, validation_keys(study, agent_ids), algorithm
 
     def _with_static(self, trial: Values) -> Study:
-        """The study with a trial's static settings."""
+        """Return the study with a trial's static settings."""
         name = self.study.algorithms[0]
         settings = getattr(self.study, name)
         static = {key: tuple(v) if isinstance(v, list) else v for key, v in trial.items() if hasattr(settings, key)}
         return self.study.model_copy(update={name: settings.model_copy(update=static)})
 
-    def _trainer(self, trial: Values, algorithm: Algorithm, agents: Agent, keys: Any, n: int) -> Trainer:
-        """The programs of a shape, compiled for the first batch that has it."""
+    def _trainer(self, trial: Values, algorithm: Algorithm, agents: Agent, keys: Key[Array, "A D"], n: int) -> Trainer:
+        """Return the trainer for a batch of ``n`` agents, compiled with the first batch of its shape."""
         study = self._with_static(trial)
         settings, static = getattr(study, study.algorithms[0]), ALGORITHMS[algorithm.name].static
         shape = tuple((key, str(getattr(settings, key))) for key in sorted(trial) if key in static)
         partition = self._partition(algorithm, n)
-        known = self._trainers.get((shape, partition.shard_size))
-        if known is None:
+        trainer = self._trainers.get((shape, partition.shard_size))
+        if trainer is None:
             validation = Validation(every=study.evaluation.validate_every, draws=study.evaluation.validation_draws)
             members, draws = take_padded((agents, keys), 0, partition.shard_size)
-            known = Trainer.compile(algorithm, members, draws, validation, partition)
-            self._trainers[(shape, partition.shard_size)] = known
-        return replace(known, partition=partition)
+            trainer = Trainer.compile(algorithm, members, draws, validation, partition)
+            self._trainers[(shape, partition.shard_size)] = trainer
+        return replace(trainer, partition=partition)
 
     def _partition(self, algorithm: Algorithm, n: int) -> Partition:
-        """A batch as equal shards, all of which are in memory, twice while they are regrouped."""
+        """Cut a batch into equal shards, which all fit in memory twice: regrouping copies them."""
         try:
             partition = partition_population(n, algorithm.agent_bytes, host.free_memory())
         except PopulationTooLargeError as error:
@@ -166,27 +169,27 @@ class SuccessiveHalving:
         return partition
 
     def _rungs(self, trainer: Trainer) -> list[int]:
-        """Chunks at which trials are compared: the first validation after each rung, and the end."""
+        """Return the numbers of chunks after which trials are compared: the first validation after each rung, and the end."""
         validations = [k + 1 for k, chunk in enumerate(trainer.chunks) if chunk.validates]
         rungs = [share * len(trainer.chunks) for share in sorted(self.space.halving.rungs)]
         return sorted({min(v for v in validations if v >= rung) for rung in rungs} | {len(trainer.chunks)})
 
-    def _train_until(self, trainings: list[Training], chunk: int, left: int) -> None:
+    def _train_until(self, trainings: list[Training], chunk: int, trials: int) -> None:
         total = len(trainings) * len(trainings[0].trainer.chunks)
         for training in trainings:
             for _ in training.run(until=chunk):
-                self.on_progress(sum(one.chunks_done for one in trainings) / total, left)
+                self.on_progress(sum(shard.chunks_done for shard in trainings) / total, trials)
 
-    def _by_trial(self, values: np.ndarray, n: int) -> np.ndarray:
-        """``[trials]`` means over the scenarios."""
-        return values[: n * self.n_scenarios].reshape(n, self.n_scenarios).mean(axis=1)
+    def _trial_means(self, values: Float[np.ndarray, " padded"], trials: int) -> Float[np.ndarray, " trials"]:
+        """Return each trial's mean over its scenarios, from one value per agent."""
+        return values[: trials * self.n_scenarios].reshape(trials, self.n_scenarios).mean(axis=1)
 
-    def _members(self, trials: Sequence[int] | np.ndarray) -> np.ndarray:
-        """Places of the agents of some trials in the population."""
+    def _members(self, trials: Sequence[int] | np.ndarray) -> Int[np.ndarray, " members"]:
+        """Return the indices of the agents of some trials in the population."""
         return (np.asarray(trials)[:, None] * self.n_scenarios + np.arange(self.n_scenarios)).ravel()
 
     def _objective(self, agents: Agent, trainings: list[Training], algorithm: Algorithm) -> list[float]:
-        """The objective of trials that are trained to the end, on draws that no validation has used."""
+        """Evaluate the objective of fully trained trials, on draws that no validation has used."""
         n, size = agents.key.shape[0], trainings[0].trainer.partition.shard_size
         keys = evaluation_keys(self.study, self.agent_ids * (n // self.n_scenarios))
         sizes = [min(size, n - k * size) for k in range(len(trainings))]
@@ -196,4 +199,4 @@ class SuccessiveHalving:
         per_trial = lifetimes.reshape(-1, self.n_scenarios)
         if self.space.objective == "mean":
             return [float(mean) for mean in per_trial.mean(axis=1)]
-        return [mean_interval(own)[1] for own in per_trial]
+        return [mean_interval(lifetimes)[1] for lifetimes in per_trial]

@@ -1,4 +1,4 @@
-"""The search itself: Optuna proposes a batch of trials, the batch trains as one population, Optuna is told."""
+"""The search: Optuna proposes a batch of trials, the batch trains as one population, and Optuna gets the outcomes."""
 
 import json
 import math
@@ -18,12 +18,13 @@ from uavmec_jax.search.space import (
     Range,
     Space,
     baseline_settings,
-    digest,
-    holds,
-    outer,
-    outer_combinations,
-    settings_of,
+    contains,
+    identity,
+    static_combinations,
+    static_settings,
+    study_changes,
 )
+from uavmec_jax.studies.schema import Study
 from uavmec_jax.studies.study import load_study, study_toml
 from uavmec_jax.training import host
 
@@ -37,24 +38,32 @@ _BATCH = "batch"
 
 @dataclass(frozen=True)
 class SearchProgress:
-    """How far a search is: trials that are over, of how many; of the batch at hand its share and the trials left in it."""
+    """The progress of a search, and of the batch in training.
+
+    Attributes:
+        trials: finished trials.
+        total_trials: number of trials.
+        batch_share: finished share of the batch.
+        batch_trials: trials of the batch that have not been pruned.
+        best: best objective so far; NaN before the first batch is finished.
+    """
 
     trials: int
     total_trials: int
-    share: float
-    left: int
+    batch_share: float
+    batch_trials: int
     best: float
 
 
 @dataclass(frozen=True)
 class SearchResult:
-    """What a search found.
+    """The result of a search.
 
     Attributes:
-        space: that was searched.
-        trials: table: ``number``, ``batch``, ``state`` (``complete`` or ``pruned``), ``value``, ``steps`` it was trained,
-            and its settings.
-        importance: setting -> share of the variance of the objective (PED-ANOVA; Watanabe et al., 2023).
+        space: the search space.
+        trials: one row per trial: ``number``, ``batch``, ``state`` (``complete`` or ``pruned``), ``value`` of the
+            objective, environment ``steps`` of its training, and its settings.
+        importance: setting -> share of the objective's variance (PED-ANOVA; Watanabe et al., 2023).
         best: settings of the best trial.
     """
 
@@ -70,7 +79,7 @@ class SearchResult:
 
     @property
     def own_value(self) -> float:
-        """The objective of the study's own settings (trial 0); of one that was given up, as far as it was trained."""
+        """The objective of the study's own settings (trial 0); if that trial was pruned, its score at the last rung."""
         return float(self.trials.loc[self.trials["number"] == 0, "value"].iloc[0])
 
 
@@ -81,59 +90,58 @@ def run_search(
     command: str = "",
     on_progress: Callable[[SearchProgress], None] = lambda _: None,
 ) -> SearchResult:
-    """Search, or go on with a search that was stopped; a batch that was under way is made again, with the same trials.
+    """Run a search, or continue one that was stopped: an unfinished batch is repeated with the same trials.
 
     Args:
         space: from :func:`uavmec_jax.search.space.load_space`.
-        directory: of the search: its database, table, and best settings.
+        directory: folder of the search: its database, table and best settings.
         command: the command line, for the label.
-        on_progress: told while batches train.
+        on_progress: called while batches train.
 
     Raises:
         StudyError: Optuna is not installed, the directory holds another search or something else, or a batch does not
             fit in memory.
     """
-    optuna = _optuna()
+    optuna = _import_optuna()
     path = Path(directory)
     _check_directory(path, space)
     path.mkdir(parents=True, exist_ok=True)
     write_text(path / FACTS, json.dumps({"space": space.model_dump(mode="json"), "command": command} | host.describe()))
-    trials = _open(optuna, path, space)
+    trials = _open_trials(optuna, path, space)
     halving = SuccessiveHalving(space)
-    batches = math.ceil(space.trials / space.batch)
-    for batch in range(batches):
-        members = _proposed(optuna, trials, space, batch)
+    for batch in range(math.ceil(space.trials / space.batch)):
+        members = _propose_batch(optuna, trials, space, batch)
         if all(trial.state.is_finished() for trial in members):
             continue
 
-        def report(share: float, left: int, over: int = batch * space.batch) -> None:
-            on_progress(SearchProgress(over, space.trials, share, left, _best_value(trials)))
+        def report(share: float, batch_trials: int, finished: int = batch * space.batch) -> None:
+            on_progress(SearchProgress(finished, space.trials, share, batch_trials, _best_value(trials)))
 
         halving.on_progress = report
-        outcomes = halving.run([_values(space, trial.params) for trial in members])
+        outcomes = halving.run([_settings(space, trial.params) for trial in members])
         for trial, outcome in zip(members, outcomes, strict=True):
             if not trial.state.is_finished():
-                _tell(optuna, trials, trial, outcome)
-    found = _found(optuna, trials, space)
-    write_text(path / TRIALS, found.trials.to_csv(index=False, float_format="%.6g"))
-    write_text(path / BEST, study_toml(best_study(found)))
-    return found
+                _record(optuna, trials, trial, outcome)
+    result = _search_result(optuna, trials, space)
+    write_text(path / TRIALS, result.trials.to_csv(index=False, float_format="%.6g"))
+    write_text(path / BEST, study_toml(best_study(result)))
+    return result
 
 
-def best_study(found: SearchResult) -> Any:
-    """The study with the best settings."""
-    study = load_study(found.space.study, settings_of(found.space, found.best))
-    return study.model_copy(update={"name": f"{found.space.name}-best"})
+def best_study(result: SearchResult) -> Study:
+    """Return the study with the best settings."""
+    study = load_study(result.space.study, study_changes(result.space, result.best))
+    return study.model_copy(update={"name": f"{result.space.name}-best"})
 
 
-def _optuna() -> Any:
+def _import_optuna() -> Any:
     optuna = host.optional("optuna", "search", "search")
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     return optuna
 
 
 def _check_directory(path: Path, space: Space) -> None:
-    """A new or empty folder, or one of this very search."""
+    """Raise a StudyError unless the folder is new, empty, or holds this very search."""
     if path.exists() and not path.is_dir():
         raise StudyError(f"{path}: exists and is not a folder; give another one with --out")
     if not path.exists() or not any(path.iterdir()):
@@ -142,12 +150,12 @@ def _check_directory(path: Path, space: Space) -> None:
         before = Space.model_validate(json.loads((path / FACTS).read_text(encoding="utf-8"))["space"], strict=True)
     except (OSError, ValueError, KeyError, TypeError):
         raise StudyError(f"{path}: is not empty and holds no search; give another folder with --out") from None
-    if digest(before) != digest(space):
+    if identity(before) != identity(space):
         raise StudyError(f"{path}: holds another search; give another folder with --out")
 
 
-def _open(optuna: Any, path: Path, space: Space) -> "optuna.Study":
-    """The search's database; its first trial has the study's own settings, as far as they lie in the space."""
+def _open_trials(optuna: Any, path: Path, space: Space) -> "optuna.Study":
+    """Open the database; the first trial of a new one has the study's own settings, as far as the space contains them."""
     from sqlalchemy import URL
     from sqlalchemy.exc import DatabaseError
 
@@ -158,19 +166,20 @@ def _open(optuna: Any, path: Path, space: Space) -> "optuna.Study":
     except DatabaseError as error:
         raise StudyError(f"{path / DATABASE}: cannot be read: {error.orig!s}") from None
     if not trials.get_trials(deepcopy=False):
-        own = baseline_settings(space)
-        trials.enqueue_trial({key: _told(own[key]) for key, values in space.space.items() if holds(values, own[key])})
+        baseline = baseline_settings(space)
+        inside = {key: value for key, value in baseline.items() if contains(space.space[key], value)}
+        trials.enqueue_trial({key: _to_optuna(value) for key, value in inside.items()})
     return trials
 
 
-def _proposed(optuna: Any, trials: "optuna.Study", space: Space, batch: int) -> list[Any]:
-    """The trials of a batch: those that were already proposed, and as many new ones as are missing.
+def _propose_batch(optuna: Any, trials: "optuna.Study", space: Space, batch: int) -> list[Any]:
+    """Return the trials of a batch: those that were proposed before, and new ones for those that are missing.
 
-    Every proposal has a sampler of its own, seeded by the trial's number, so that a search that was stopped proposes
-    what it would have proposed. The outer settings are the same for all of a batch: the first batches have one
-    combination each, until all were tried; later ones have what the sampler chooses for their first trial.
+    Each proposal has its own sampler, seeded by the trial's number, so that a search that was stopped continues with the
+    proposals of an uninterrupted one. All trials of a batch share their static settings: each of the first batches has
+    one combination, until all were tried; in later batches the sampler chooses them for the first trial.
     """
-    names, combinations, own = outer(space), outer_combinations(space), baseline_settings(space)
+    names, combinations, baseline = static_settings(space), static_combinations(space), baseline_settings(space)
     size = min(space.batch, space.trials - batch * space.batch)
     members = [trial for trial in trials.get_trials(deepcopy=False) if trial.user_attrs.get(_BATCH) == batch]
     while len(members) < size:
@@ -178,12 +187,11 @@ def _proposed(optuna: Any, trials: "optuna.Study", space: Space, batch: int) -> 
         sampler = optuna.samplers.TPESampler(
             seed=space.seed * 1_000_003 + number, multivariate=True, n_startup_trials=space.batch
         )
+        fixed: dict[str, Any] = {}
         if members:
             fixed = {key: members[0].params[key] for key in names}
-        else:
-            fixed = (
-                {key: _told(value) for key, value in combinations[batch].items()} if batch < len(combinations) else {}
-            )
+        elif batch < len(combinations):
+            fixed = {key: _to_optuna(value) for key, value in combinations[batch].items()}
         if fixed:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
@@ -191,33 +199,39 @@ def _proposed(optuna: Any, trials: "optuna.Study", space: Space, batch: int) -> 
         trials.sampler = sampler
         trial = trials.ask()
         for key, values in space.space.items():
-            _suggest(trial, key, values, own[key])
+            _suggest(trial, key, values, baseline[key])
         trial.set_user_attr(_BATCH, batch)
         members.append(trials.get_trials(deepcopy=False)[trial.number])
     return sorted(members, key=lambda trial: trial.number)
 
 
-def _suggest(trial: Any, key: str, values: Range | Choices, own: Any) -> None:
+def _suggest(trial: Any, key: str, values: Range | Choices, baseline: Any) -> None:
+    """Let Optuna choose a setting of a trial, as a whole number if the study's own value is one."""
     if isinstance(values, Choices):
-        trial.suggest_categorical(key, [_told(value) for value in values.choices])
-    elif isinstance(own, int) and not isinstance(own, bool):
+        trial.suggest_categorical(key, [_to_optuna(value) for value in values.choices])
+    elif isinstance(baseline, int) and not isinstance(baseline, bool):
         trial.suggest_int(key, int(values.low), int(values.high), log=values.log)
     else:
         trial.suggest_float(key, float(values.low), float(values.high), log=values.log)
 
 
-def _told(value: Any) -> Any:
-    """A value as Optuna takes it: lists are text."""
+def _to_optuna(value: Any) -> Any:
+    """Convert a setting for Optuna, which stores lists as text."""
     return json.dumps(value) if isinstance(value, list) else value
 
 
-def _values(space: Space, params: Mapping[str, Any]) -> dict[str, Any]:
-    """A trial's settings as the study takes them."""
-    lists = {key for key, one in space.space.items() if isinstance(one, Choices) and isinstance(one.choices[0], list)}
+def _settings(space: Space, params: Mapping[str, Any]) -> dict[str, Any]:
+    """Convert Optuna's parameters of a trial back into settings."""
+    lists = {
+        key
+        for key, values in space.space.items()
+        if isinstance(values, Choices) and isinstance(values.choices[0], list)
+    }
     return {key: json.loads(params[key]) if key in lists else params[key] for key in space.space}
 
 
-def _tell(optuna: Any, trials: "optuna.Study", trial: Any, outcome: TrialOutcome) -> None:
+def _record(optuna: Any, trials: "optuna.Study", trial: Any, outcome: TrialOutcome) -> None:
+    """Store the outcome of a trial."""
     live = optuna.trial.Trial(trials, trial._trial_id)
     for step, value in outcome.rungs.items():
         live.report(value, step)
@@ -232,18 +246,19 @@ def _best_value(trials: "optuna.Study") -> float:
     return max((value for value in values if value is not None), default=float("nan"))
 
 
-def _found(optuna: Any, trials: "optuna.Study", space: Space) -> SearchResult:
+def _search_result(optuna: Any, trials: "optuna.Study", space: Space) -> SearchResult:
+    """Build the result from the database."""
     rows = []
     for trial in trials.get_trials(deepcopy=False)[: space.trials]:
         if trial.state.is_finished():
-            facts = {"number": trial.number, "batch": trial.user_attrs[_BATCH], "state": trial.state.name.lower()}
-            facts |= {"value": trial.value, "steps": max(trial.intermediate_values, default=0)}
-            rows.append(facts | {key: _told(value) for key, value in _values(space, trial.params).items()})
+            row = {"number": trial.number, "batch": trial.user_attrs[_BATCH], "state": trial.state.name.lower()}
+            row |= {"value": trial.value, "steps": max(trial.intermediate_values, default=0)}
+            rows.append(row | {key: _to_optuna(value) for key, value in _settings(space, trial.params).items()})
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
             evaluator = optuna.importance.PedAnovaImportanceEvaluator()
             importance = optuna.importance.get_param_importances(trials, evaluator=evaluator)
-        except (ValueError, RuntimeError):  # fewer than two trials that are complete, or all alike
+        except (ValueError, RuntimeError):  # fewer than two complete trials, or all with the same objective
             importance = {}
-    return SearchResult(space, pd.DataFrame(rows), dict(importance), _values(space, trials.best_params))
+    return SearchResult(space, pd.DataFrame(rows), dict(importance), _settings(space, trials.best_params))

@@ -1,4 +1,4 @@
-"""Search spaces: files that say what is searched, on which towns, and when a trial is given up."""
+"""Search spaces: files that say which settings are searched, on which scenarios, and when a trial is pruned."""
 
 import itertools
 import json
@@ -23,26 +23,26 @@ from uavmec_jax.studies.study import load_study
 _LIBRARY = resources.files("uavmec_jax.search") / "library"
 
 REWARD = "reward."
-"""Before the name of a term, for its weight in the reward."""
+"""Prefix of the reward's terms among the settings."""
 
 
 class Range(StrictModel):
-    """Numbers between two bounds."""
+    """All numbers between two bounds."""
 
     low: float | int
     high: float | int
     log: bool = False
-    """Equal shares for equal ratios."""
+    """Whether they are sampled log-uniformly."""
 
 
 class Choices(StrictModel):
-    """Some values."""
+    """A list of values."""
 
     choices: Annotated[list[Any], Field(min_length=2)]
 
 
 class ValidationScenarios(StrictModel):
-    """Where trials are evaluated: scenarios of their own, never those that the study reports."""
+    """The scenarios on which trials are evaluated: never those that the study reports."""
 
     seeds: Annotated[int, Field(ge=1, le=1000)] = 2
     first_seed: Annotated[int, Field(ge=0, lt=2**30)] = 1_000_000
@@ -55,64 +55,68 @@ class Halving(StrictModel):
     """Successive halving (Jamieson and Talwalkar, 2016) within a batch."""
 
     rungs: list[Annotated[float, Field(gt=0, lt=1)]] = Field(default_factory=list)
-    """Shares of the training at which the worst trials are pruned; by default none are."""
+    """Shares of the training after which the worst trials are pruned; by default no trial is pruned."""
     keep: Annotated[float, Field(gt=0, lt=1)] = 0.5
     """Share of the trials that continue."""
 
 
 class Space(StrictModel):
-    """A search."""
+    """A search: the study, the settings to search, the budget and the scenarios."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=80)] = "search"
     study: str
-    """Whose settings are searched: a shipped study or a file."""
+    """The study whose settings are searched: a shipped one or a file."""
     change: dict[str, Any] = Field(default_factory=dict)
-    """Settings of the study that differ in the search, by dotted names."""
+    """Settings of the study that the search changes, by dotted names."""
     trials: Annotated[int, Field(ge=1, le=100_000)] = 64
     batch: Annotated[int, Field(ge=1, le=4096)] = 16
-    """Trials that train together."""
+    """Number of trials that train together."""
     objective: Literal["mean", "low"] = "mean"
-    """Mean lifetime of the best weights, or the lower end of its 95 % interval over the scenarios."""
+    """The objective: mean lifetime of the best weights, or the lower end of its 95 % interval over the scenarios."""
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
     validation: ValidationScenarios = ValidationScenarios()
     halving: Halving = Halving()
     confirm_seeds: Annotated[int, Field(ge=0, le=1000)] = 5
-    """Seeds of the study, from 0, on which the best settings are compared with the study's own; 0 for none."""
+    """Number of the study's seeds, from 0, on which the best settings are compared with its own; 0 for no comparison."""
     space: dict[str, Range | Choices]
-    """Hyperparameters, ``reward.TERM``, or, with choices, static settings -> values to search."""
+    """Setting -> values to search: hyperparameters, ``reward.TERM``, and static settings, which need choices."""
 
     def base(self) -> Study:
-        """The study with this search's changes.
+        """Return the study with the changes of this search.
 
         Raises:
-            StudyError: it is not one of a single algorithm, or the changes do not fit.
+            StudyError: the study has several algorithms or an axis of settings, or the changes do not fit.
         """
         study = load_study(self.study, self.change)
         if len(study.algorithms) != 1:
             raise StudyError(f"{self.name}: study {self.study!r} trains {len(study.algorithms)} algorithms; search one")
-        more = [axis for axis in study.axes if axis not in ("powered", "connected", "cells", "seeds")]
-        if more:
-            raise StudyError(f"{self.name}: study {self.study!r} has the axis {more[0]}; search one setting of it")
+        others = [axis for axis in study.axes if axis not in ("powered", "connected", "cells", "seeds")]
+        if others:
+            raise StudyError(f"{self.name}: study {self.study!r} has the axis {others[0]}; search one setting of it")
         return study
 
 
 def shipped_spaces() -> dict[str, Any]:
-    """Spaces inside the package: name -> file."""
+    """Return the spaces that ship with the package: name -> file."""
     return {Path(file.name).stem: file for file in _LIBRARY.iterdir() if file.name.endswith(".toml")}
 
 
 def load_space(name_or_path: str, overrides: Mapping[str, Any] | None = None) -> Space:
-    """A space that ships with the package, or a file.
+    """Load a space that ships with the package, or a file.
+
+    Args:
+        name_or_path: the name of a shipped space, or a TOML file.
+        overrides: settings that replace those of the file.
 
     Raises:
-        StudyError: it is missing, is not TOML, or holds something that does not fit; one line.
+        StudyError: the file is missing, is not TOML, or has an entry that does not fit.
     """
     library = shipped_spaces()
     if name_or_path in library:
         text = library[name_or_path].read_text(encoding="utf-8")
     elif not Path(name_or_path).is_file():
-        known = suggest(Path(name_or_path).stem, library)
-        raise StudyError(f"{name_or_path}: neither a file of a search space nor a shipped one; {known}")
+        hint = suggest(Path(name_or_path).stem, library)
+        raise StudyError(f"{name_or_path}: neither a file of a search space nor a shipped one; {hint}")
     else:
         text = read_text(Path(name_or_path), StudyError)
     data = {"name": Path(name_or_path).stem} | parse_toml(text, name_or_path, StudyError) | dict(overrides or {})
@@ -125,32 +129,28 @@ def load_space(name_or_path: str, overrides: Mapping[str, Any] | None = None) ->
 
 
 def _check(source: str, space: Space) -> None:
-    """Everything that is searched can be, within bounds, and the towns are not those that are reported."""
+    """Raise a StudyError unless every setting can be searched and the scenarios are not those that the study reports."""
     study = space.base()
     name = study.algorithms[0]
     declared, settings = ALGORITHMS[name], getattr(study, name)
-    for key, wanted_values in space.space.items():
+    names = (*declared.traced, *declared.static, *(REWARD + term for term in TERMS))
+    for key, values in space.space.items():
         where = f"{source}: space.{key}"
-        if key.startswith(REWARD):
-            known = key.removeprefix(REWARD) in TERMS
-        else:
-            known = key in declared.traced or key in declared.static
-        if not known:
-            names = (*declared.traced, *declared.static, *(REWARD + term for term in TERMS))
+        if key not in names:
             raise StudyError(f"{where} is not a setting of {name}; {suggest(key, names)}")
-        if isinstance(wanted_values, Range):
-            _check_range(where, key, wanted_values, declared.static)
-        for value in values_at_the_edge(wanted_values):
+        if isinstance(values, Range):
+            _check_range(where, key, values, declared.static)
+        for value in boundary_values(values):
             if not key.startswith(REWARD):
                 _check_value(where, type(settings), key, value)
-    towns = space.validation
-    taken = set(seeds_of(study)) & set(range(towns.first_seed, towns.first_seed + towns.seeds))
-    if taken:
+    scenarios = space.validation
+    reported = set(seeds_of(study)) & set(range(scenarios.first_seed, scenarios.first_seed + scenarios.seeds))
+    if reported:
         raise StudyError(
-            f"{source}: validation.first_seed is {towns.first_seed}: town {min(taken)} is one that the study reports; "
-            "give a number beyond its seeds"
+            f"{source}: validation.first_seed is {scenarios.first_seed}: the study reports the scenarios of seed "
+            f"{min(reported)}; give a number beyond its seeds"
         )
-    for cell in towns.cells or ():
+    for cell in scenarios.cells or ():
         if not all(0 <= count <= study.params.n_devices for count in cell):
             raise StudyError(
                 f"{source}: validation.cells has {list(cell)}; give counts from 0 to {study.params.n_devices}"
@@ -174,62 +174,62 @@ def _check_value(where: str, settings: Any, key: str, value: Any) -> None:
         raise StudyError(f"{where} has {value!r}; {expectation(error.errors()[0])}") from None
 
 
-def values_at_the_edge(values: Range | Choices) -> list[Any]:
-    """All choices, or both ends of a range."""
+def boundary_values(values: Range | Choices) -> list[Any]:
+    """Return all choices, or both ends of a range."""
     return values.choices if isinstance(values, Choices) else [values.low, values.high]
 
 
-def holds(values: Range | Choices, value: Any) -> bool:
-    """Whether a value is one of those that are searched."""
+def contains(values: Range | Choices, value: Any) -> bool:
+    """Return whether a value is one of those that are searched."""
     return value in values.choices if isinstance(values, Choices) else values.low <= value <= values.high
 
 
-def outer(space: Space) -> list[str]:
-    """What shapes the program: the same for all trials of a batch."""
+def static_settings(space: Space) -> list[str]:
+    """Return the searched settings that shape the program, and are thus the same for all trials of a batch."""
     declared = ALGORITHMS[space.base().algorithms[0]]
     return [key for key in space.space if key in declared.static]
 
 
-def outer_combinations(space: Space) -> list[dict[str, Any]]:
-    """Every combination of what shapes the program; the study's own first, if it is one of them."""
-    names = outer(space)
-    own = {key: value for key, value in baseline_settings(space).items() if key in names}
+def static_combinations(space: Space) -> list[dict[str, Any]]:
+    """Return every combination of the static settings; the study's own first, if it is one of them."""
+    names = static_settings(space)
+    baseline = {key: value for key, value in baseline_settings(space).items() if key in names}
     choices = [values.choices for key in names if isinstance(values := space.space[key], Choices)]
-    found = [dict(zip(names, combination, strict=True)) for combination in itertools.product(*choices)]
-    return sorted(found, key=lambda combination: combination != own) if names else []
+    combinations = [dict(zip(names, combination, strict=True)) for combination in itertools.product(*choices)]
+    return sorted(combinations, key=lambda combination: combination != baseline) if names else []
 
 
 def baseline_settings(space: Space) -> dict[str, Any]:
-    """The study's own values of what is searched."""
+    """Return the study's own values of the searched settings."""
     study = space.base()
     settings = getattr(study, study.algorithms[0])
     reward = reward_terms(study)
     return {
-        key: reward.get(key.removeprefix(REWARD), 0.0) if key.startswith(REWARD) else plain(getattr(settings, key))
+        key: reward.get(key.removeprefix(REWARD), 0.0) if key.startswith(REWARD) else toml_value(getattr(settings, key))
         for key in space.space
     }
 
 
 def reward_terms(study: Study) -> dict[str, float]:
-    """The weights of a study's reward by term."""
+    """Return the weights of a study's reward by term."""
     if isinstance(study.reward, dict):
         return dict(study.reward)
     return {term: float(w) for term, w in zip(TERMS, REWARDS[study.reward], strict=True) if w}
 
 
-def plain(value: Any) -> Any:
-    """A setting as TOML and JSON know it."""
+def toml_value(value: Any) -> Any:
+    """Convert a setting to the types of TOML and JSON, which have no tuples."""
     return list(value) if isinstance(value, tuple) else value
 
 
 def reward_with(study: Study, values: Mapping[str, Any]) -> dict[str, float]:
-    """The weights of a study's reward with those among a trial's values."""
+    """Return the weights of a study's reward by term, with the weights among a trial's settings."""
     searched = {key.removeprefix(REWARD): float(value) for key, value in values.items() if key.startswith(REWARD)}
     return reward_terms(study) | searched
 
 
-def settings_of(space: Space, values: Mapping[str, Any]) -> dict[str, Any]:
-    """A trial's values as changes of the study, by dotted names."""
+def study_changes(space: Space, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the changes of the study that a search and the settings of a trial make, by dotted names."""
     study = space.base()
     name = study.algorithms[0]
     changes = {f"{name}.{key}": value for key, value in values.items() if not key.startswith(REWARD)}
@@ -237,6 +237,6 @@ def settings_of(space: Space, values: Mapping[str, Any]) -> dict[str, Any]:
     return dict(space.change) | changes | reward
 
 
-def digest(space: Space) -> str:
-    """What tells spaces apart; more trials are still the same search."""
+def identity(space: Space) -> str:
+    """Return the text that identifies a search; one with more trials is still the same search."""
     return json.dumps(space.model_dump(mode="json", exclude={"trials", "confirm_seeds"}), sort_keys=True)
