@@ -1,0 +1,96 @@
+"""The rooms of the package: imports go down, `env` is pure JAX, and no import is hidden in a function to go up."""
+
+import ast
+import graphlib
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SCRIPT = ROOT / "experiments" / "draw_imports.py"
+house = runpy.run_path(str(SCRIPT))
+PACKAGE, modules, room_of = house["PACKAGE"], house["modules"], house["room_of"]
+MODULES = modules(ROOT)
+IMPORTS = house["read_imports"](ROOT)
+OURS = [one for one in IMPORTS if one.imported.split(".")[0] == PACKAGE]
+
+ORDER = (
+    *("cli", "interop", "reporting", "search", "runs", "studies", "scenarios", "training", "agents", "planning"),
+    *("traffic", "env", "files", "errors"),
+)
+"""The rooms from top to bottom."""
+
+INSIDE_FUNCTIONS = {
+    "interop.gymnasium_env": ("uavmec_jax.reporting.map_figure",),  # matplotlib, for those who render
+    "interop.five_values": ("gymnax.environments",),  # the caller's library
+    "runs.cluster": ("uavmec_jax.runs.shared_run",),  # on the node: cores are chosen before JAX is used
+    "search.search": ("sqlalchemy", "sqlalchemy.exc"),  # of the extra `search`
+    "traffic.worker": ("libsumo",),  # of the extra `traffic`
+}
+"""Modules with imports inside functions, beside `cli`, where they are for the sake of the start-up time."""
+
+
+def test_every_room_has_its_place():
+    assert {room_of(module) for module in MODULES} - set(house["NO_ROOM"]) == set(ORDER)
+
+
+@pytest.mark.parametrize("room", ORDER)
+def test_a_room_imports_only_rooms_below(room):
+    below = {room, *ORDER[ORDER.index(room) + 1 :], "_version"}
+    wrong = [(one.importer, one.imported) for one in OURS if room_of(one.importer) == room]
+    assert [pair for pair in wrong if room_of(pair[1]) not in below] == []
+
+
+def test_no_circle_between_modules():
+    graph = {module: set() for module in MODULES}
+    for one in OURS:
+        if one.importer != PACKAGE and one.imported != one.importer:
+            graph[one.importer].add(one.imported)
+    graphlib.TopologicalSorter(graph).prepare()  # raises CycleError, which names the modules
+
+
+def test_env_is_pure_jax():
+    imported = {one.imported for one in IMPORTS if room_of(one.importer) == "env"}
+    ours = {room_of(module) for module in imported if module.split(".")[0] == PACKAGE}
+    assert ours <= {"env", "errors"}
+    others = {module.split(".")[0] for module in imported} - {PACKAGE}
+    assert others & {"pydantic", "pathlib", "os", "io", "json", "tomllib", "csv", "importlib", "shutil"} == set()
+    for module, file in MODULES.items():
+        if room_of(module) == "env":
+            names = {node.id for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.Name)}
+            assert "open" not in names, module
+
+
+def test_imports_inside_functions_are_listed():
+    found: dict[str, set[str]] = {}
+    for one in IMPORTS:
+        if one.function and room_of(one.importer) != "cli":
+            found.setdefault(one.importer.removeprefix(f"{PACKAGE}."), set()).add(one.imported)
+    assert found == {module: set(imported) for module, imported in INSIDE_FUNCTIONS.items()}
+
+
+def test_the_picture_is_drawn(tmp_path):
+    command = [sys.executable, SCRIPT, "--root", ROOT, "--out", tmp_path / "imports.png"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert "; 0 go up\n" in done.stdout
+    assert (tmp_path / "imports.png").stat().st_size > 10_000
+
+
+def test_the_order_of_an_unknown_checkout_has_as_few_imports_up_as_possible(tmp_path):
+    package = tmp_path / PACKAGE
+    package.mkdir()
+    for room, text in {
+        "a": "from uavmec_jax import b, d",
+        "b": "from uavmec_jax import c",
+        "c": "import uavmec_jax.a",
+    }.items():
+        (package / f"{room}.py").write_text(text)
+    (package / "d.py").write_text("def f():\n    from uavmec_jax import a\n    from . import c\n")
+    counts, inside = house["count_between_rooms"](house["read_imports"](tmp_path))
+    assert counts == {("a", "b"): 1, ("a", "d"): 1, ("b", "c"): 1, ("c", "a"): 1}
+    assert inside == {("d", "a"): 1, ("d", "c"): 1}
+    order = house["order_rooms"](["a", "b", "c", "d"], counts + inside)
+    assert sum(order.index(importer) > order.index(imported) for importer, imported in counts + inside) == 2
