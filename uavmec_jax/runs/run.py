@@ -10,7 +10,6 @@ from typing import Any
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files.leases import Leases
 from uavmec_jax.runs.folder import RUN_PLAN, SHARDS, RunFolder
-from uavmec_jax.runs.label import label_of
 from uavmec_jax.runs.log import OnEvent, tensorboard_writer
 from uavmec_jax.runs.options import RunOptions
 from uavmec_jax.runs.results_folder import (
@@ -22,7 +21,7 @@ from uavmec_jax.runs.results_folder import (
     read_finished_shards,
     worker_hint,
 )
-from uavmec_jax.runs.run_plan import RunPlan, plan_run
+from uavmec_jax.runs.run_plan import RunPlan, label_of, plan_run
 from uavmec_jax.runs.shard_runner import ShardRunner
 from uavmec_jax.runs.signals import StopSignal
 from uavmec_jax.runs.team import work_together

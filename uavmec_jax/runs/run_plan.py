@@ -1,13 +1,17 @@
 """The run plan: how a study is cut into shards, and the memory it needs, before anything is compiled or written."""
 
-from dataclasses import dataclass
+import datetime
+import sys
+from dataclasses import asdict, dataclass
 from functools import cached_property
+from typing import Any
 
 import jax
 
 from uavmec_jax.errors import StudyError
-from uavmec_jax.studies.places import load_evacuations
-from uavmec_jax.studies.population import make_algorithm, n_agents, split_by_algorithm
+from uavmec_jax.studies.places import describe_places, load_evacuations
+from uavmec_jax.studies.population import make_algorithm, n_agents, seeds_of, split_by_algorithm
+from uavmec_jax.studies.results import SCHEMA
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.training import host
 from uavmec_jax.training.partition import Partition, PopulationTooLargeError, partition_population
@@ -138,3 +142,20 @@ def plan_run(study: Study, *, workers: int = 1, shard_size: int | None = None, j
         except PopulationTooLargeError as error:
             raise StudyError(f"{study.name}: steps is {study.steps}: {error}") from None
     return RunPlan(agents=agents, partitions=partitions, members=members, steps=steps, workers=workers, free_bytes=free)
+
+
+def label_of(study: Study, plan: RunPlan, command: str | None) -> dict[str, Any]:
+    """Return the label of a run, what ``run.json`` says before it starts: study, command, partitions, versions, hardware."""
+    return {
+        "schema": SCHEMA,
+        "study": study.name,
+        "command": command or " ".join(sys.argv),
+        "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "complete": False,
+        "agents": plan.agents,
+        "seeds": seeds_of(study),
+        **({"places": places} if (places := describe_places(study)) else {}),
+        "workers": plan.workers,
+        "partitions": {name: asdict(partition) for name, partition in plan.partitions.items()},
+        **host.describe(),
+    }

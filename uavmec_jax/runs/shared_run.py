@@ -5,7 +5,6 @@ from pathlib import Path
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files.leases import Leases
 from uavmec_jax.runs.folder import SHARDS, RunFolder
-from uavmec_jax.runs.label import label_of
 from uavmec_jax.runs.log import OnEvent
 from uavmec_jax.runs.options import RunOptions
 from uavmec_jax.runs.results_folder import (
@@ -15,7 +14,7 @@ from uavmec_jax.runs.results_folder import (
     finished_shards,
     worker_hint,
 )
-from uavmec_jax.runs.run_plan import plan_run
+from uavmec_jax.runs.run_plan import label_of, plan_run
 from uavmec_jax.runs.signals import StopSignal
 from uavmec_jax.runs.worker import OnProgress, Worker, make_worker
 from uavmec_jax.studies.schema import Study
