@@ -39,7 +39,7 @@ def advise(
     named = scenario.load(state)
     if price is not None:
         named = named.with_failure_price(price)
-    advice, warnings = advise_on(named, policy, samples=samples, what_if=what_if, seed=scenario.seed)
+    advice, warnings = advise_on(named, policy, samples=samples, what_if=what_if, seed=scenario.axes["seed"])
     for line in warnings:
         click.echo(f"uavmec: warning: {line}", err=True)
     names = named.device_names

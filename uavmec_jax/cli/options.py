@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,46 +25,19 @@ class ScenarioChoice:
 
     Attributes:
         file: a scenario file, or ``None`` for a random scenario.
-        powered: number of devices with grid power, of a random scenario.
-        connected: number of devices with communication, of a random scenario.
-        place: a simulated evacuation whose devices' positions the random scenario has.
-        seed: seed of the random scenario and of the volume draws.
+        axes: the random scenario on the axes of studies: ``powered``, ``connected``, ``seed`` and perhaps ``place``.
         settings: scenario parameters to change, by name.
     """
 
     file: Path | None
-    powered: int
-    connected: int
-    place: str | None
-    seed: int
-    settings: dict[str, Any] = field(default_factory=dict)
+    axes: dict[str, Any]
+    settings: dict[str, Any]
 
     def load(self, state: Path | None = None) -> Any:
-        """Load the scenario.
-
-        Args:
-            state: file of its current state; by default it starts from the initial one.
-
-        Returns:
-            The :class:`NamedScenario`.
-        """
+        """Load the :class:`NamedScenario`, in the state of a file or in its initial state."""
         from uavmec_jax.scenarios.load import load_scenario
 
-        return load_scenario(
-            self.file,
-            state=state,
-            place=self.place,
-            powered=self.powered,
-            connected=self.connected,
-            seed=self.seed,
-            settings=self.settings,
-        )
-
-    @property
-    def axes(self) -> dict[str, Any]:
-        """The random scenario's values on the axes of a study."""
-        axes = {"powered": self.powered, "connected": self.connected, "seed": self.seed}
-        return axes | ({"place": self.place} if self.place else {})
+        return load_scenario(self.file, state=state, settings=self.settings, **self.axes)
 
 
 def scenario_options(*, argument: bool) -> Callable[[Callable], Callable]:
@@ -96,29 +69,16 @@ def scenario_options(*, argument: bool) -> Callable[[Callable], Callable]:
 
     def decorate(command: Callable) -> Callable:
         @functools.wraps(command)
-        def with_scenario(
-            file: Path | None,
-            powered: int | None,
-            connected: int | None,
-            place: str | None,
-            seed: int,
-            settings: tuple[str, ...],
-            **others: Any,
-        ) -> Any:
-            if file is not None and (powered, connected, place) != (None, None, None):
+        def with_scenario(file: Path | None, settings: tuple[str, ...], seed: int, **others: Any) -> Any:
+            given = {name: others.pop(name) for name in ("powered", "connected", "place")}
+            given = {name: value for name, value in given.items() if value is not None}
+            if file is not None and given:
                 raise InputError(
                     f"{file}: a scenario file says which devices have power and communication, and where they are; leave "
                     "out --powered, --connected, --place"
                 )
-            choice = ScenarioChoice(
-                file=file,
-                powered=_DEFAULT_COUNT if powered is None else powered,
-                connected=_DEFAULT_COUNT if connected is None else connected,
-                place=place,
-                seed=seed,
-                settings=dict(assignment(setting) for setting in settings),
-            )
-            return command(scenario=choice, **others)
+            axes = {"powered": _DEFAULT_COUNT, "connected": _DEFAULT_COUNT, "seed": seed} | given
+            return command(scenario=ScenarioChoice(file, axes, dict(map(assignment, settings))), **others)
 
         return _add_options(with_scenario, options)
 
