@@ -1,15 +1,14 @@
-"""Checkpoints of a shard in training: our archive against Orbax, by time, size and what a flipped bit does.
+"""Checkpoints of a shard in training: our archive and Orbax compared by time, size and detection of flipped bits.
 
     uv run python experiments/benchmark_checkpoints.py --out results/checkpoints
 
-The state is that of a shard of DQN agents with filled replays. Both formats save and restore it in turn, repetition by
+The state is that of a shard of DQN agents with filled replay buffers. Both formats save and restore it in turn, repetition by
 repetition; then a copy of each checkpoint gets one bit flipped at a random place, many times, and is restored. A flip is
 *silent* if nothing is raised and the restored state differs.
 """
 
 import argparse
 import contextlib
-import json
 import logging
 import shutil
 import sys
@@ -21,10 +20,10 @@ from typing import Any
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
+from reports import write_report
 
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files.archives import open_checked, write_checked
-from uavmec_jax.files.writing import write_text
 from uavmec_jax.studies.population import make_agents, make_algorithm, validation_keys
 from uavmec_jax.studies.study import load_study
 from uavmec_jax.training import host
@@ -36,7 +35,7 @@ SCHEMA = 1
 
 
 def start_training(steps: int) -> Training:
-    """Return a shard of Table 5 whose replay is filled: all of its ``steps`` steps but the last chunk are done."""
+    """Train a shard of Table 5, for ``steps`` steps less the last chunk, so that its replay buffers are filled."""
     study = load_study("table5", {"axes.seeds": 2, "steps": steps})
     algorithm, agents = make_algorithm(study), make_agents(study)
     keys = validation_keys(study)
@@ -53,12 +52,12 @@ class Archive:
     """Our checkpoint: one file, CRC-32 for each array and a SHA-256 over all."""
 
     def save(self, path: Path, training: Training) -> None:
-        """Write it whole or not at all."""
+        """Write a checkpoint."""
         path.mkdir()
         write_checked(path / "checkpoint.npz", SCHEMA, {}, training.arrays(), compressed=False)
 
     def restore(self, path: Path, training: Training) -> None:
-        """Check and restore it."""
+        """Check a checkpoint and restore it."""
         with open_checked(path / "checkpoint.npz", SCHEMA, "a checkpoint", StudyError) as (_, arrays):
             training.restore(training.chunks_done, arrays)
 
@@ -70,12 +69,12 @@ class Orbax:
         self._checkpointer = ocp.StandardCheckpointer()
 
     def save(self, path: Path, training: Training) -> None:
-        """Write and wait until it is committed."""
+        """Write a checkpoint, and wait until it is committed."""
         self._checkpointer.save(path, state_of(training))
         self._checkpointer.wait_until_finished()
 
     def restore(self, path: Path, training: Training) -> None:
-        """Restore onto the devices."""
+        """Restore a checkpoint onto the devices."""
         abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, state_of(training))
         restored = jax.block_until_ready(self._checkpointer.restore(path, abstract))
         for batch, (state, best) in zip(training.group_batches, restored, strict=True):
@@ -83,31 +82,31 @@ class Orbax:
 
 
 def state_of(training: Training) -> list[tuple[Any, Any]]:
-    """Everything that changes on the devices."""
+    """Return what changes on the devices during training."""
     return [(batch.state, batch.best) for batch in training.group_batches]
 
 
 def flip_bit(path: Path, rng: np.random.Generator) -> str:
-    """Flip one random bit of a checkpoint; files are chosen by their size. Returns the file's name."""
+    """Flip one random bit of a checkpoint, and return the name of its file; files are chosen in proportion to their sizes."""
     files = sorted(file for file in path.rglob("*") if file.is_file() and file.stat().st_size)
     sizes = np.array([file.stat().st_size for file in files], float)
     file = files[rng.choice(len(files), p=sizes / sizes.sum())]
     with file.open("r+b") as content:
-        place = int(rng.integers(file.stat().st_size))
-        content.seek(place)
+        offset = int(rng.integers(file.stat().st_size))
+        content.seek(offset)
         byte = content.read(1)[0]
-        content.seek(place)
+        content.seek(offset)
         content.write(bytes([byte ^ (1 << int(rng.integers(8)))]))
     return file.name
 
 
 def same(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:
-    """Whether two states are equal to the bit."""
+    """Return whether two states have the same bits."""
     return all(np.array_equal(a[name].view(np.uint8), b[name].view(np.uint8)) for name in a)
 
 
 def measure(training: Training, repetitions: int, flips: int) -> dict[str, Any]:
-    """Time both formats in turn, and flip bits."""
+    """Time both formats in turn, and count the flipped bits that each detects."""
     formats: dict[str, Any] = {"archive": Archive(), "orbax": Orbax()}
     truth = {name: leaf.copy() for name, leaf in training.arrays().items()}
     rows: dict[str, Any] = {name: {"save_s": [], "restore_s": []} for name in formats}
@@ -132,7 +131,7 @@ def measure(training: Training, repetitions: int, flips: int) -> dict[str, Any]:
 
 
 def count_flips(kind: Any, path: Path, training: Training, truth: dict[str, np.ndarray], flips: int) -> dict[str, int]:
-    """Restore copies with one bit flipped: how many are reported, harmless, silent."""
+    """Restore copies with one flipped bit; count those that are reported, harmless, and silent."""
     counts, rng = {"reported": 0, "harmless": 0, "silent": 0}, np.random.default_rng(0)
     for _ in range(flips):
         copy = path.with_name("flipped")
@@ -162,8 +161,7 @@ def main() -> None:
     rows = measure(start_training(arguments.steps), arguments.repetitions, arguments.flips)
     report = {"command": " ".join(["python", *sys.argv]), "orbax": ocp.__version__, **host.describe(), "formats": rows}
     if arguments.out:
-        arguments.out.mkdir(parents=True, exist_ok=True)
-        write_text(arguments.out / "checkpoints.json", json.dumps(report, indent=1) + "\n")
+        write_report(arguments.out / "checkpoints.json", report)
     for name, row in rows.items():
         print(
             f"{name:8} {row['bytes'] / 1e6:7.1f} MB  save {row['save_s']['median']:.2f} s  "

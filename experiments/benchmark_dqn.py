@@ -2,8 +2,9 @@
 
     uv run --group sb3 python experiments/benchmark_dqn.py --out results/benchmark
 
-Same algorithm for both (batch 16, one gradient step per four environment steps), replay filled with 100,000 transitions
-per agent before the clock starts. Without the `sb3` group the comparison is left out. Prints a table, writes JSON.
+Both run the same algorithm (batches of 16, one gradient step per four environment steps), with replay buffers that hold
+100,000 transitions per agent before the clock starts. Without the `sb3` group the comparison is left out. Prints a table and
+writes ``benchmark_dqn.json``.
 """
 
 import argparse
@@ -12,14 +13,20 @@ import os
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
+from typing import Any
+
+from reports import write_report
 
 FILLED = 100_000
-AGENTS = (1, 8, 75, 300)
+"""Transitions per agent in the replay buffer when the clock starts."""
+POPULATIONS = (1, 8, 75, 300)
+"""Numbers of agents that train together."""
 
 
 def train_speed(n_agents: int, seconds: float) -> dict:
-    """Environment steps/s of training with ``n_agents`` agents on a filled replay."""
+    """Measure the environment steps/s of training with ``n_agents`` agents and filled replay buffers."""
     import jax
     import jax.numpy as jnp
 
@@ -28,18 +35,22 @@ def train_speed(n_agents: int, seconds: float) -> dict:
 
     axes = f"[axes]\npowered = [8]\nconnected = [8]\nseeds = {n_agents}"
     study = parse_study(f"steps = {2 * FILLED}\n{axes}", "benchmark")
-    played = 1000
-    repeats = FILLED // played // 4
-    fill = jax.jit(
-        lambda rows: rows.at[:, 1 : FILLED + 1].set(jnp.tile(rows[:, 1 : 4 * played + 1], (1, repeats, 1))),
-        donate_argnums=0,
-    )
-    prepare = lambda state: state.replace(rows=fill(state.rows))  # noqa: E731
-    return {"agents": n_agents} | training_speed(study, seconds, warm_up=played, start=FILLED // 4, prepare=prepare)
+    warm_up = 1000
+    repeats = FILLED // warm_up // 4
+
+    @partial(jax.jit, donate_argnums=0)
+    def fill(rows: jax.Array) -> jax.Array:
+        """Repeat the transitions of the warm-up."""
+        return rows.at[:, 1 : FILLED + 1].set(jnp.tile(rows[:, 1 : 4 * warm_up + 1], (1, repeats, 1)))
+
+    def prepare(state: Any) -> Any:
+        return state.replace(buffer_state=fill(state.buffer_state))
+
+    return {"agents": n_agents} | training_speed(study, seconds, warm_up=warm_up, start=FILLED // 4, prepare=prepare)
 
 
 def ceiling(agents_per_device: int, seconds: float) -> float:
-    """Environment steps/s if nothing but the batched matrix products of the same shapes had to be done."""
+    """Measure the environment steps/s of a training that consists of its batched matrix products alone."""
     import jax
     import jax.numpy as jnp
     import numpy as np
@@ -52,33 +63,34 @@ def ceiling(agents_per_device: int, seconds: float) -> float:
     shapes = ((24, 64), (64, 64), (64, 12))
 
     def products(_: int, carry: tuple) -> tuple:
-        x, one, weights, target = carry
+        batch, observation, weights, target = carry
         for _ in range(4):  # acting
-            y = one
+            q = observation
             for w in weights:
-                y = y @ w
-            one = one + 1e-9 * jnp.sum(y, keepdims=True)
-        y = x
-        for w in target:  # the target's forward pass
-            y = y @ w
+                q = q @ w
+            observation = observation + 1e-9 * jnp.sum(q, keepdims=True)
+        td_target = batch
+        for w in target:  # forward pass of the target network
+            td_target = td_target @ w
 
-        def forward(weights: tuple) -> jax.Array:  # forward and backward
-            z = x
+        def loss(weights: tuple) -> jax.Array:  # forward and backward pass
+            q = batch
             for w in weights:
-                z = matmul(z, w)
-            return jnp.sum(z * y)
+                q = matmul(q, w)
+            return jnp.sum(q * td_target)
 
-        gradient = jax.grad(forward)(weights)
-        return x, one, jax.tree.map(lambda w, g: w - 1e-9 * g, weights, gradient), target
+        gradient = jax.grad(loss)(weights)
+        return batch, observation, jax.tree.map(lambda w, g: w - 1e-9 * g, weights, gradient), target
 
-    def many(carry: tuple, steps: int) -> tuple:
+    def all_agents(carry: tuple, steps: int) -> tuple:
         return jax.vmap(lambda carry: jax.lax.fori_loop(0, steps, products, carry))(carry)
 
     n = agents_per_device * len(devices)
     weights = tuple(jax.random.normal(jax.random.key(i), (n, *shape)) * 0.1 for i, shape in enumerate(shapes))
     carry = (jnp.ones((n, 16, 24)), jnp.ones((n, 1, 24)), weights, tuple(w + 0 for w in weights))
     split = PartitionSpec("agents")
-    run = jax.jit(jax.shard_map(many, mesh=mesh, in_specs=(split, PartitionSpec()), out_specs=split, check_vma=False))
+    specs = {"in_specs": (split, PartitionSpec()), "out_specs": split, "check_vma": False}
+    run = jax.jit(jax.shard_map(all_agents, mesh=mesh, **specs))
     carry = jax.block_until_ready(run(carry, 200))
     rates, deadline = [], time.perf_counter() + seconds
     while time.perf_counter() < deadline:
@@ -89,7 +101,7 @@ def ceiling(agents_per_device: int, seconds: float) -> float:
 
 
 def sb3_worker(seconds: float) -> None:
-    """Print the environment steps/s of one Stable-Baselines3 process."""
+    """Measure the environment steps/s of one Stable-Baselines3 process, and print them as JSON."""
     os.environ["JAX_PLATFORMS"] = "cpu"
     import numpy as np
     import torch
@@ -97,7 +109,7 @@ def sb3_worker(seconds: float) -> None:
 
     from uavmec_jax.interop.gymnasium_env import UavMecGymEnv
 
-    torch.set_num_threads(1)  # faster than several for nets this small
+    torch.set_num_threads(1)  # faster than several for networks this small
     model = DQN(
         "MlpPolicy", UavMecGymEnv(), learning_rate=0.0071, batch_size=16, gamma=0.98,
         buffer_size=2 * FILLED, exploration_fraction=0.35, policy_kwargs={"net_arch": [64, 64]}, device="cpu", seed=0,
@@ -123,18 +135,18 @@ def sb3_worker(seconds: float) -> None:
 
 
 def sb3_speed(processes: int, seconds: float) -> tuple[float, float]:
-    """Environment steps/s of that many Stable-Baselines3 processes together; share of the time spent in the environment."""
+    """Measure Stable-Baselines3 processes: environment steps/s of all together, and the environment's share of the time."""
     command = [sys.executable, __file__, "--sb3-worker", "--seconds", str(seconds)]
     running = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(processes)]
     outputs = [process.communicate()[0] for process in running]
-    said = [json.loads(output.splitlines()[-1]) for output in outputs]
-    return sum(one["steps_per_second"] for one in said), max(one["environment_share"] for one in said)
+    rows = [json.loads(output.splitlines()[-1]) for output in outputs]
+    return sum(row["steps_per_second"] for row in rows), max(row["environment_share"] for row in rows)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=10.0, help="length of each measurement")
-    parser.add_argument("--agents", type=int, nargs="+", default=AGENTS, help="sizes of the populations")
+    parser.add_argument("--agents", type=int, nargs="+", default=POPULATIONS, help="sizes of the populations")
     parser.add_argument("--out", type=Path, help="folder for benchmark_dqn.json")
     parser.add_argument("--sb3-worker", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -156,8 +168,8 @@ def main() -> None:
     report = {"command": " ".join(["python", *sys.argv]), **facts, "filled_transitions_per_agent": FILLED}
     has_sb3 = find_spec("stable_baselines3") is not None
     missing = (float("nan"), float("nan"))
-    one, share = sb3_speed(1, arguments.seconds) if has_sb3 else missing
-    report |= {"sb3_one_process": one, "sb3_environment_share": share}
+    sb3_alone, share = sb3_speed(1, arguments.seconds) if has_sb3 else missing
+    report |= {"sb3_one_process": sb3_alone, "sb3_environment_share": share}
     cores = facts["cores"]
     report["sb3_processes"] = cores
     report["sb3_all_processes"], _ = sb3_speed(cores, arguments.seconds) if has_sb3 else missing
@@ -168,24 +180,26 @@ def main() -> None:
     table = Table(title="DQN training, environment steps/s", title_justify="left")
     for column in ("what", "steps/s", "x one SB3 process", "of the ceiling", "compile s"):
         table.add_column(column, justify="left" if column == "what" else "right")
-    against = lambda speed: f"{speed / one:,.1f}" if has_sb3 else "-"  # noqa: E731
+
+    def ratio(speed: float) -> str:
+        return f"{speed / sb3_alone:,.1f}" if has_sb3 else "-"
+
     if has_sb3:
-        every = report["sb3_all_processes"]
-        table.add_row(f"Stable-Baselines3, one process ({share:.0%} environment)", f"{one:,.0f}", "1.0", "", "")
-        table.add_row(f"Stable-Baselines3, {cores} processes", f"{every:,.0f}", against(every), "", "")
+        together = report["sb3_all_processes"]
+        table.add_row(f"Stable-Baselines3, one process ({share:.0%} environment)", f"{sb3_alone:,.0f}", "1.0", "", "")
+        table.add_row(f"Stable-Baselines3, {cores} processes", f"{together:,.0f}", ratio(together), "", "")
     for row in report["training"]:
         speed = row["steps_per_second"]
         name = f"this package, {row['agents']} agent{'s' * (row['agents'] > 1)}"
         ceiling_share = f"{speed / report['ceiling']:.0%}"
-        table.add_row(name, f"{speed:,.0f}", against(speed), ceiling_share, f"{row['compile_seconds']:.1f}")
+        table.add_row(name, f"{speed:,.0f}", ratio(speed), ceiling_share, f"{row['compile_seconds']:.1f}")
     name = f"matrix products of {len(facts['devices']) * (AGENTS_PER_CORE - 2)} agents alone"
-    table.add_row(name, f"{report['ceiling']:,.0f}", against(report["ceiling"]), "100%", "")
+    table.add_row(name, f"{report['ceiling']:,.0f}", ratio(report["ceiling"]), "100%", "")
     for n, speed in report["environment"].items():
         table.add_row(f"environment alone, {n} layouts", f"{speed:,.0f}", "", "", "")
     Console(width=100).print(table)
     if arguments.out:
-        arguments.out.mkdir(parents=True, exist_ok=True)
-        (arguments.out / "benchmark_dqn.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        write_report(arguments.out / "benchmark_dqn.json", report)
 
 
 if __name__ == "__main__":

@@ -2,24 +2,26 @@
 
     uv run --group sb3 python experiments/benchmark_on_policy.py --out results/benchmark
 
-Both with the library's defaults (PPO: 2,048 steps, ten epochs of minibatches of 64; A2C: 5 steps). Without the `sb3` group
-the comparison is left out. Prints a table, writes JSON.
+Both run with the library's defaults (PPO: 2,048 steps, ten epochs of minibatches of 64; A2C: 5 steps). Without the `sb3`
+group the comparison is left out. Prints a table and writes ``benchmark_on_policy.json``.
 """
 
 import argparse
-import json
 import os
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+from reports import write_report
+
 ALGORITHMS = ("ppo", "a2c")
-AGENTS = (1, 8, 75, 300)
+POPULATIONS = (1, 8, 75, 300)
+"""Numbers of agents that train together."""
 
 
 def train_speed(algorithm: str, n_agents: int, seconds: float, n_envs: int = 1) -> dict:
-    """Environment steps/s of training with ``n_agents`` agents."""
+    """Measure the environment steps/s of training with ``n_agents`` agents of ``n_envs`` environments each."""
     from uavmec_jax.runs.speed import training_speed
     from uavmec_jax.studies.study import parse_study
 
@@ -29,24 +31,24 @@ def train_speed(algorithm: str, n_agents: int, seconds: float, n_envs: int = 1) 
 
 
 def sb3_worker(algorithm: str, seconds: float) -> None:
-    """Print the environment steps/s of one Stable-Baselines3 process."""
+    """Measure the environment steps/s of one Stable-Baselines3 process, and print them."""
     os.environ["JAX_PLATFORMS"] = "cpu"
     import stable_baselines3
     import torch
 
     from uavmec_jax.interop.gymnasium_env import UavMecGymEnv
 
-    torch.set_num_threads(1)  # faster than several for nets this small
+    torch.set_num_threads(1)  # faster than several for networks this small
     model = getattr(stable_baselines3, algorithm.upper())("MlpPolicy", UavMecGymEnv(), gamma=0.98, device="cpu", seed=0)
     model.learn(2048)
-    begun, steps = time.perf_counter(), model.num_timesteps
-    while time.perf_counter() - begun < seconds:
+    started, steps = time.perf_counter(), model.num_timesteps
+    while time.perf_counter() - started < seconds:
         model.learn(2048, reset_num_timesteps=False)
-    print((model.num_timesteps - steps) / (time.perf_counter() - begun))
+    print((model.num_timesteps - steps) / (time.perf_counter() - started))
 
 
 def sb3_speed(algorithm: str, processes: int, seconds: float) -> float:
-    """Environment steps/s of that many Stable-Baselines3 processes together."""
+    """Measure the environment steps/s of several Stable-Baselines3 processes together."""
     command = [sys.executable, __file__, "--sb3-worker", algorithm, "--seconds", str(seconds)]
     running = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(processes)]
     return sum(float(process.communicate()[0].splitlines()[-1]) for process in running)
@@ -55,7 +57,7 @@ def sb3_speed(algorithm: str, processes: int, seconds: float) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=10.0, help="length of each measurement")
-    parser.add_argument("--agents", type=int, nargs="+", default=AGENTS, help="sizes of the population")
+    parser.add_argument("--agents", type=int, nargs="+", default=POPULATIONS, help="sizes of the populations")
     parser.add_argument("--out", type=Path, help="folder for benchmark_on_policy.json")
     parser.add_argument("--sb3-worker", choices=ALGORITHMS, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -77,23 +79,25 @@ def main() -> None:
     for column in ("what", "steps/s", "x one SB3 process", "compile s"):
         table.add_column(column, justify="left" if column == "what" else "right")
     for algorithm in ALGORITHMS:
-        one = sb3_speed(algorithm, 1, arguments.seconds) if has_sb3 else float("nan")
-        every = sb3_speed(algorithm, facts["cores"], arguments.seconds) if has_sb3 else float("nan")
-        report["sb3"][algorithm] = {"one_process": one, "processes": facts["cores"], "all_processes": every}
-        against = lambda speed, one=one: f"{speed / one:,.1f}" if has_sb3 else "-"  # noqa: E731
+        alone = sb3_speed(algorithm, 1, arguments.seconds) if has_sb3 else float("nan")
+        together = sb3_speed(algorithm, facts["cores"], arguments.seconds) if has_sb3 else float("nan")
+        report["sb3"][algorithm] = {"one_process": alone, "processes": facts["cores"], "all_processes": together}
+
+        def ratio(speed: float, alone: float = alone) -> str:
+            return f"{speed / alone:,.1f}" if has_sb3 else "-"
+
         if has_sb3:
-            table.add_row(f"Stable-Baselines3 {algorithm.upper()}, one process", f"{one:,.0f}", "1.0", "")
-            table.add_row(f"Stable-Baselines3, {facts['cores']} processes", f"{every:,.0f}", against(every), "")
+            table.add_row(f"Stable-Baselines3 {algorithm.upper()}, one process", f"{alone:,.0f}", "1.0", "")
+            table.add_row(f"Stable-Baselines3, {facts['cores']} processes", f"{together:,.0f}", ratio(together), "")
         for agents, n_envs in (*((n, 1) for n in arguments.agents), (8, 16)):
             row = train_speed(algorithm, agents, arguments.seconds, n_envs)
             report["training"].append(row)
             name = f"this package, {agents} agent{'s' * (agents > 1)}{f' x {n_envs} environments' * (n_envs > 1)}"
             speed = row["steps_per_second"]
-            table.add_row(name, f"{speed:,.0f}", against(speed), f"{row['compile_seconds']:.1f}")
+            table.add_row(name, f"{speed:,.0f}", ratio(speed), f"{row['compile_seconds']:.1f}")
     Console(width=100).print(table)
     if arguments.out:
-        arguments.out.mkdir(parents=True, exist_ok=True)
-        (arguments.out / "benchmark_on_policy.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        write_report(arguments.out / "benchmark_on_policy.json", report)
 
 
 if __name__ == "__main__":

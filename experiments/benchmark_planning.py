@@ -1,32 +1,30 @@
-"""Planning speed and what the beam's width buys: 100 layouts per cell, compilation included where it says so.
+"""Speed of the planners, and the lifetimes that a wider beam reaches, on 100 layouts per cell.
 
     uv run python experiments/benchmark_planning.py [--layouts 100] [--widths 16 64 256] [--out results/planning]
 
-Writes `benchmark_planning.json` and prints the same as a table.
+Prints a table and writes ``benchmark_planning.json``; times are those of the first call, with compilation, and of the second.
 """
 
 import argparse
-import json
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from uavmec_jax.training import host
-
-host.use_all_cores()
-
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
+import jax
+import jax.numpy as jnp
+import numpy as np
+from reports import write_report
 
 from uavmec_jax.env.params import Params
 from uavmec_jax.planning.beam import horizon
 from uavmec_jax.planning.parallel import beam_episodes, bound_scenarios, rollout_planner_episodes
 from uavmec_jax.planning.rollout_planner import SAMPLES
 from uavmec_jax.scenarios.seeds import held_out_draws, layout_for_seed
+from uavmec_jax.training import host
 
 CELLS = [(12, 4), (10, 10), (8, 8), (4, 4)]
+"""Counts of powered and connected devices."""
 
 
 def main() -> None:
@@ -35,11 +33,11 @@ def main() -> None:
     parser.add_argument("--widths", type=int, nargs="+", default=[256, 64, 16])
     parser.add_argument("--out", type=Path, default=Path("results/planning"))
     arguments = parser.parse_args()
+    host.use_all_cores()
 
     rows = [row for cell in CELLS for row in benchmark(*cell, arguments.layouts, arguments.widths)]
-    arguments.out.mkdir(parents=True, exist_ok=True)
     report = {"command": "uv run python experiments/benchmark_planning.py", "rows": rows, **host.describe()}
-    (arguments.out / "benchmark_planning.json").write_text(json.dumps(report, indent=1) + "\n")
+    write_report(arguments.out / "benchmark_planning.json", report)
     print(f"{'powered':>8}{'connected':>10}  {'planner':<10}{'mean slots':>11}{'s, compiled':>13}{'s, first':>10}")
     for row in rows:
         print(
@@ -49,7 +47,7 @@ def main() -> None:
 
 
 def benchmark(powered: int, connected: int, count: int, widths: list[int]) -> list[dict[str, Any]]:
-    """One row per planner: mean lifetime, seconds of the first call (with compilation) and of the second."""
+    """Return a row per planner: mean lifetime, seconds of the first call (with compilation) and of the second."""
     params = jax.tree.map(lambda leaf: jnp.full(count, leaf), Params())
     layouts = jax.vmap(lambda seed: layout_for_seed(seed, Params(), powered, connected))(jnp.arange(count))
     keys = jnp.concatenate([held_out_draws(seed, powered, connected, 1) for seed in range(count)])
@@ -57,14 +55,14 @@ def benchmark(powered: int, connected: int, count: int, widths: list[int]) -> li
     slots = horizon(params, layouts)
     rows, reached = [], np.ones(count)
 
-    def measure(planner: str, play: Callable, *arguments: Any, **options: Any) -> np.ndarray:
-        jax.clear_caches()  # the first time is what a fresh process needs
-        found, first = timed(play, *arguments, **options)
-        _, again = timed(play, *arguments, **options)
-        lives = np.asarray(found[1].length if isinstance(found, tuple) else found)
+    def measure(planner: str, function: Callable, *arguments: Any, **options: Any) -> np.ndarray:
+        jax.clear_caches()  # the first call takes what it takes in a new process
+        result, first = timed(function, *arguments, **options)
+        _, second = timed(function, *arguments, **options)
+        lifetimes = np.asarray(result[1].length if isinstance(result, tuple) else result)
         cell = {"powered": powered, "connected": connected, "layouts": count, "planner": planner}
-        rows.append(cell | {"mean": float(lives.mean()), "seconds_first": first, "seconds_compiled": again})
-        return lives
+        rows.append(cell | {"mean": float(lifetimes.mean()), "seconds_first": first, "seconds_compiled": second})
+        return lifetimes
 
     for width in widths:
         reached = np.maximum(reached, measure(f"beam {width}", beam_episodes, *scenarios, slots=slots, width=width))
@@ -74,6 +72,7 @@ def benchmark(powered: int, connected: int, count: int, widths: list[int]) -> li
 
 
 def timed(function: Callable, *arguments: Any, **options: Any) -> tuple[Any, float]:
+    """Call a function; return its result and the seconds that it took."""
     tick = time.perf_counter()
     result = jax.block_until_ready(function(*arguments, **options))
     return result, time.perf_counter() - tick

@@ -4,42 +4,23 @@
 
 (a) Two learning rates on one layout, 0.01 and 0.0071, for 1,000,000 steps, and 0.0071 for 400,000 steps.
 (b) Three seeds with 8 powered and 8 connected devices.
-Thin lines: training episodes, 10,000 steps at a time; thick lines: the greedy policy on validation draws.
+Thin lines: training episodes between two validations; thick lines: the greedy policy on validation draws, smoothed.
 """
 
 import argparse
 from pathlib import Path
 
-from uavmec_jax.training import host
-
-host.use_all_cores()
-
-import numpy as np  # noqa: E402
-import pandas as pd  # noqa: E402
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
 
 from uavmec_jax.reporting import canvas
 from uavmec_jax.runs.run import run_study
 from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.study import parse_study
+from uavmec_jax.training import host
 
-ONE_LAYOUT = "[axes]\npowered = [8]\nconnected = [8]\nseeds = {seeds}\n"
-
-
-def run(out: Path, name: str, seeds: list[int], steps: int, learning_rates: list[float]) -> Results:
-    text = ONE_LAYOUT.format(seeds=seeds) + f"learning_rate = {learning_rates}\n"
-    return run_study(parse_study(text, name, {"steps": steps, "name": name}), out / name)
-
-
-def draw(axis: object, results: Results, agent: int, label: str) -> None:
-    curves = results.curves["dqn"]
-    per_look = np.diff(np.searchsorted(curves["chunk_steps"], curves["validation_steps"], side="right"), prepend=0)
-    ends = np.cumsum(per_look)
-    training = [
-        np.nanmean(curves["episode_length"][agent, end - n : end]) for end, n in zip(ends, per_look, strict=True)
-    ]
-    (line,) = axis.plot(curves["validation_steps"], training, lw=0.8, alpha=0.5)
-    smooth = pd.Series(curves["validation"][agent]).rolling(5, center=True, min_periods=1).mean()
-    axis.plot(curves["validation_steps"], smooth, lw=1.8, color=line.get_color(), label=label)
+AXES = "[axes]\npowered = [8]\nconnected = [8]\nseeds = {seeds}\nlearning_rate = {learning_rates}\n"
 
 
 def main() -> None:
@@ -47,6 +28,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/figure3"))
     parser.add_argument("--steps", type=int, default=1_000_000)
     arguments = parser.parse_args()
+    host.use_all_cores()
     steps = arguments.steps
     long = run(arguments.out, "learning-rates", [0], steps, [0.01, 0.0071])
     short = run(arguments.out, "short", [0], steps * 2 // 5, [0.0071])
@@ -67,12 +49,28 @@ def main() -> None:
         axis.grid(alpha=0.3)
         axis.legend()
     canvas.save(figure, arguments.out / "figure3.png")
+    columns = ["seed", "learning_rate", "steps", "best_lifetime", "last_lifetime", "oldest_first_lifetime"]
     for results in (long, short, seeds):
-        print(
-            results.agents[
-                ["seed", "learning_rate", "steps", "best_lifetime", "last_lifetime", "oldest_first_lifetime"]
-            ]
-        )
+        print(results.agents[columns])
+
+
+def run(out: Path, name: str, seeds: list[int], steps: int, learning_rates: list[float]) -> Results:
+    """Train one agent per seed and learning rate."""
+    axes = AXES.format(seeds=seeds, learning_rates=learning_rates)
+    return run_study(parse_study(axes, name, {"steps": steps, "name": name}), out / name)
+
+
+def draw(axis: Axes, results: Results, agent: int, label: str) -> None:
+    """Draw the training and validation curves of one agent."""
+    curves = results.curves["dqn"]
+    # The chunks between two validations are averaged.
+    ends = np.searchsorted(curves["chunk_steps"], curves["validation_steps"], side="right")
+    starts = np.concatenate([[0], ends[:-1]])
+    episode_length = curves["episode_length"][agent]
+    training = [np.nanmean(episode_length[start:end]) for start, end in zip(starts, ends, strict=True)]
+    (line,) = axis.plot(curves["validation_steps"], training, lw=0.8, alpha=0.5)
+    smooth = pd.Series(curves["validation"][agent]).rolling(5, center=True, min_periods=1).mean()
+    axis.plot(curves["validation_steps"], smooth, lw=1.8, color=line.get_color(), label=label)
 
 
 if __name__ == "__main__":

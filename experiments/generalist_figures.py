@@ -1,4 +1,4 @@
-"""Figures of the generalist: how near the bound, how soon, how reliable its forecasts, what traffic costs."""
+"""Figures of the generalist: distance from the bound, training, reliability of its forecasts, and traffic."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from uavmec_jax.reporting.canvas import new_figure, save
+from uavmec_jax.reporting.heat_map import heat_map_figure
 from uavmec_jax.reporting.tables import display_name
 
 PAPER_TRAINING_S = 660.0
@@ -15,40 +16,25 @@ PAPER_TRAINING_S = 660.0
 
 
 def ratio_figure(table: pd.DataFrame, path: Path) -> None:
-    """Lifetimes over the upper bound's, cell by cell: heat maps of oldest-first, generalist and beam.
+    """Draw lifetimes as percentages of the upper bound, cell by cell: heat maps of oldest-first, generalist and beam.
 
     Args:
-        table: a row per town with ``powered``, ``connected`` and a lifetime per policy, ``bound`` among them.
-        path: of the figure.
+        table: one row per layout with ``powered``, ``connected`` and the lifetime of each policy and of ``bound``.
+        path: where the figure is written.
     """
     names = [name for name in ("oldest_first", "generalist", "beam") if name in table]
     cells = table.groupby(["powered", "connected"], sort=False)[[*names, "bound"]].mean().reset_index()
-    figure = new_figure(3.6 * len(names) + 0.6, 3.6)
-    axes = np.atleast_1d(figure.subplots(1, len(names), sharey=True))
-    for axis, name in zip(axes, names, strict=True):
-        cells["ratio"] = 100 * cells[name] / cells["bound"]
-        grid = cells.pivot(index="powered", columns="connected", values="ratio").sort_index(ascending=False)
-        grid = grid[sorted(grid.columns, reverse=True)]
-        image = axis.imshow(grid.to_numpy(), vmin=70, vmax=100, cmap="viridis")
-        for (row, column), value in np.ndenumerate(grid.to_numpy()):
-            axis.text(
-                column, row, f"{value:.1f}", ha="center", va="center", color="w" if value < 90 else "k", fontsize=9
-            )
-        axis.set_xticks(range(grid.shape[1]), grid.columns)
-        axis.set_yticks(range(grid.shape[0]), grid.index)
-        axis.set_xlabel("devices with communication")
-        axis.set_title(f"{display_name(name)}: {grid.to_numpy().mean():.1f} %")
-    axes[0].set_ylabel("devices with power")
-    figure.colorbar(image, ax=list(axes), label="lifetime, % of the upper bound")
-    save(figure, path)
+    ratios = cells.assign(**{name: 100 * cells[name] / cells["bound"] for name in names})
+    panels = [(name, f"{display_name(name)}: {ratios[name].mean():.1f} %") for name in names]
+    save(heat_map_figure(ratios, panels, (70.0, 100.0), "lifetime, % of the upper bound"), path)
 
 
 def reliability_figure(bins: pd.DataFrame, path: Path) -> None:
-    """Of all forecasts of about some probability, how many came true.
+    """Draw the reliability diagram: the share of the forecasts of each probability that came true.
 
     Args:
-        bins: see :class:`experiments.forecast_quality.ForecastQuality`.
-        path: of the figure.
+        bins: see :class:`forecast_quality.ForecastQuality`.
+        path: where the figure is written.
     """
     figure = new_figure(4.6, 4.6)
     axis = figure.subplots()
@@ -69,21 +55,23 @@ def reliability_figure(bins: pd.DataFrame, path: Path) -> None:
 
 
 def training_figure(curve: Mapping[str, Any], path: Path) -> None:
-    """Lifetime on unseen towns against the seconds spent on training, the paper's 11 minutes marked.
+    """Draw the lifetime on unseen layouts over the seconds of training, with the paper's 11 minutes marked.
 
     Args:
-        curve: ``ppo`` with ``seconds`` and ``slots``; ``dqn`` likewise, of agents trained in their own towns;
-            ``lines``: mean slots of what needs no training, by name.
-        path: of the figure.
+        curve: ``ppo`` with ``seconds`` and ``slots``; ``dqn`` likewise, for agents that are trained on their own layouts;
+            ``lines``: mean lifetimes without training, by policy.
+        path: where the figure is written.
     """
     figure = new_figure(7.2, 4.4)
     axis = figure.subplots()
-    axis.plot(curve["ppo"]["seconds"], curve["ppo"]["slots"], "o-", label="generalist, once for all towns")
+    axis.plot(curve["ppo"]["seconds"], curve["ppo"]["slots"], "o-", label="generalist, trained once for all layouts")
     if "dqn" in curve:
-        axis.plot(curve["dqn"]["seconds"], curve["dqn"]["slots"], "s--", label="the paper's DQN, for each town again")
+        axis.plot(
+            curve["dqn"]["seconds"], curve["dqn"]["slots"], "s--", label="the paper's DQN, trained on each layout"
+        )
     for number, (name, slots) in enumerate(curve["lines"].items()):
         axis.axhline(slots, color="0.6", linewidth=0.8)
-        side = "top" if number % 2 else "bottom"  # neighbours may be near
+        side = "top" if number % 2 else "bottom"  # so that close lines have readable labels
         axis.annotate(display_name(name), (0.01, slots), xycoords=("axes fraction", "data"), fontsize=8, va=side)
     axis.axvline(PAPER_TRAINING_S, color="tab:red", linewidth=1, linestyle=":")
     axis.annotate(
@@ -103,19 +91,19 @@ def training_figure(curve: Mapping[str, Any], path: Path) -> None:
 
 
 def trade_off_figure(table: pd.DataFrame, path: Path) -> None:
-    """Lifetime against the share of first failures on high-traffic devices, a point for each price.
+    """Draw the lifetime over the share of first failures on devices in high traffic, one point per price.
 
     Args:
         table: columns ``place``, ``price``, ``lifetime``, ``busy_first``.
-        path: of the figure.
+        path: where the figure is written.
     """
     places = list(dict.fromkeys(table["place"]))
     figure = new_figure(3.6 * len(places), 3.6)
     axes = np.atleast_1d(figure.subplots(1, len(places)))
     for axis, place in zip(axes, places, strict=True):
-        own = table[table["place"] == place]
-        axis.plot(100 * own["busy_first"], own["lifetime"], "o-")
-        for _, row in own.iterrows():
+        rows = table[table["place"] == place]
+        axis.plot(100 * rows["busy_first"], rows["lifetime"], "o-")
+        for _, row in rows.iterrows():
             axis.annotate(
                 f"{row['price']:g}",
                 (100 * row["busy_first"], row["lifetime"]),

@@ -1,9 +1,9 @@
-"""How fast the generalist decides: one decision after compilation, and many at once, each in a scenario of its own.
+"""The generalist's speed: one decision after compilation, and a batch of decisions in as many scenarios.
 
     uv run python experiments/generalist_speed.py [--scenarios 8192] [--out results/generalist]
 
-Writes `speed.json`: the median of the times of single decisions, and decisions per second in a batch on all cores, the best
-and the median of the repetitions (the machine is shared).
+Writes `speed.json`: the median time of single decisions, and decisions per second in a batch on all cores, the best and the
+median of the repetitions.
 """
 
 import argparse
@@ -13,19 +13,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from uavmec_jax.training import host
+import jax
+import numpy as np
+from jaxtyping import Array
+from reports import write_report
 
-host.use_all_cores()
-
-import jax  # noqa: E402
-import numpy as np  # noqa: E402
-
-from uavmec_jax.env.dynamics import initial_state
-from uavmec_jax.env.layout import sample_layout
+from uavmec_jax.env.dynamics import State, initial_state
+from uavmec_jax.env.layout import Layout, sample_layout
 from uavmec_jax.env.params import Params
-from uavmec_jax.planning.heuristics import HEURISTICS
+from uavmec_jax.env.rollout import Policy
 from uavmec_jax.planning.parallel import spread
 from uavmec_jax.scenarios.policies import load_policy
+from uavmec_jax.training import host
 
 _BATCH = 256
 """Scenarios that a core decides for at once."""
@@ -38,41 +37,48 @@ def main() -> None:
     parser.add_argument("--repetitions", type=int, default=21)
     parser.add_argument("--out", type=Path, default=Path("results/generalist"))
     arguments = parser.parse_args()
+    host.use_all_cores()
 
     params, count = Params(), arguments.scenarios
     layouts = jax.vmap(lambda key: sample_layout(key, params, 8, 8))(jax.random.split(jax.random.key(0), count))
     states = jax.vmap(lambda layout: initial_state(params, layout))(layouts)
-    first = jax.tree.map(lambda leaf: leaf[0], (layouts, states))
-    rows = {}
-    for name in (arguments.policy, "earliest-deadline"):
-        policy = load_policy(name) if name not in HEURISTICS else HEURISTICS[name]
-        decide = lambda layout, state, policy=policy: policy(params, layout, state)  # noqa: E731
-        one = measure(jax.jit(decide), first, 10 * arguments.repetitions)
-        many = measure(
-            jax.jit(lambda *those, decide=decide: spread(decide, *those, batch=_BATCH)),
-            (layouts, states),
-            arguments.repetitions,
-        )
-        rows[name] = {
-            "one_decision_us": round(1e6 * float(np.median(one)), 1),
-            "decisions_per_second": round(count / float(np.median(many))),
-            "decisions_per_second_best": round(count / min(many)),
-        }
+    rows = {
+        name: measure(load_policy(name), params, layouts, states, arguments.repetitions)
+        for name in (arguments.policy, "earliest-deadline")
+    }
     report = {"command": "uv run python experiments/generalist_speed.py", "scenarios": count, "policies": rows}
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    (arguments.out / "speed.json").write_text(json.dumps(report | host.describe(), indent=1) + "\n", encoding="utf-8")
+    write_report(arguments.out / "speed.json", report | host.describe())
     print(json.dumps(rows, indent=1))
 
 
-def measure(function: Callable, arguments: tuple[Any, ...], repetitions: int) -> list[float]:
-    """Seconds of every call after the first."""
+def measure(policy: Policy, params: Params, layouts: Layout, states: State, repetitions: int) -> dict[str, float]:
+    """Time a policy on the first scenario, and on all of them."""
+
+    def decide(layout: Layout, state: State) -> Array:
+        return policy(params, layout, state)
+
+    def decide_all(layouts: Layout, states: State) -> Array:
+        return spread(decide, layouts, states, batch=_BATCH)
+
+    first = jax.tree.map(lambda leaf: leaf[0], (layouts, states))
+    single = time_calls(jax.jit(decide), first, 10 * repetitions)
+    batch, count = time_calls(jax.jit(decide_all), (layouts, states), repetitions), layouts.capacity.shape[0]
+    return {
+        "one_decision_us": round(1e6 * float(np.median(single)), 1),
+        "decisions_per_second": round(count / float(np.median(batch))),
+        "decisions_per_second_best": round(count / min(batch)),
+    }
+
+
+def time_calls(function: Callable, arguments: tuple[Any, ...], repetitions: int) -> list[float]:
+    """Return the seconds of every call after the first, which compiles."""
     jax.block_until_ready(function(*arguments))
-    found = []
+    seconds = []
     for _ in range(repetitions):
         tick = time.perf_counter()
         jax.block_until_ready(function(*arguments))
-        found.append(time.perf_counter() - tick)
-    return found
+        seconds.append(time.perf_counter() - tick)
+    return seconds
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
-"""Golden numbers from Stable-Baselines3 itself: what our learners are held against, update by update.
+"""Golden numbers from Stable-Baselines3, with which our algorithms are compared update by update.
 
     uv run --group sb3 python experiments/parity_sb3.py --out tests/golden/sb3
 
-Plays and learns with the library's own DQN, PPO and A2C, recording every minibatch, loss, clipped gradient and the weights
-around each step; epsilon over the steps; initial weights; and the order of target copies and gradient steps. The tests
-in tests/learning/test_parity.py read the files; versions are in versions.json.
+Runs the library's own DQN, PPO and A2C and records the minibatches, losses, clipped gradients and weights of gradient steps,
+epsilon over the steps, initial weights, and the order of target updates and gradient steps. The tests in
+tests/agents/test_parity.py read the files; the versions are in versions.json.
 """
 
 import argparse
@@ -32,6 +32,7 @@ import uavmec_jax.interop  # noqa: F401  (registers UavMec-v0)
 
 TABLE_4 = {"learning_rate": 0.0071, "batch_size": 16, "gamma": 0.98, "exploration_fraction": 0.35}
 UPDATES = 10
+"""Gradient steps that are recorded."""
 
 
 def environment() -> gymnasium.Env:
@@ -43,7 +44,7 @@ def weights_of(module: torch.nn.Module) -> dict[str, np.ndarray]:
 
 
 class Recorder:
-    """Losses, clipped gradients and weights of every gradient step of a model."""
+    """Records the losses, clipped gradients and weights of every gradient step of a model."""
 
     def __init__(self, module: torch.nn.Module, optimizer: torch.optim.Optimizer) -> None:
         self.module, self.optimizer = module, optimizer
@@ -55,30 +56,31 @@ class Recorder:
     def recording(self) -> Iterator[None]:
         backward, step = torch.Tensor.backward, self.optimizer.step
 
-        def noted_backward(loss: torch.Tensor, *arguments: Any, **named: Any) -> None:
+        def recorded_backward(loss: torch.Tensor, *arguments: Any, **named: Any) -> None:
             self.losses.append(loss.item())
             backward(loss, *arguments, **named)
 
-        def noted_step(*arguments: Any, **named: Any) -> None:
+        def recorded_step(*arguments: Any, **named: Any) -> None:
             parameters = self.module.named_parameters()
             self.gradients.append({n: p.grad.numpy().copy() for n, p in parameters if p.grad is not None})
             step(*arguments, **named)
             self.weights.append(weights_of(self.module))
 
         with (
-            mock.patch.object(torch.Tensor, "backward", noted_backward),
-            mock.patch.object(self.optimizer, "step", noted_step),
+            mock.patch.object(torch.Tensor, "backward", recorded_backward),
+            mock.patch.object(self.optimizer, "step", recorded_step),
         ):
             yield
 
     def arrays(self, *steps: int) -> dict[str, np.ndarray]:
-        """Losses of all steps; gradients of the first; weights after the given numbers of steps."""
-        kept = {f"weights_{step}/{name}": leaf for step in (0, *steps) for name, leaf in self.weights[step].items()}
-        kept |= {f"gradient/{name}": leaf for name, leaf in self.gradients[0].items()}
-        return kept | {"losses": np.array(self.losses, np.float32)}
+        """Return the losses of all steps, the gradients of the first, and the weights after the given numbers of steps."""
+        arrays = {f"weights_{step}/{name}": leaf for step in (0, *steps) for name, leaf in self.weights[step].items()}
+        arrays |= {f"gradient/{name}": leaf for name, leaf in self.gradients[0].items()}
+        return arrays | {"losses": np.array(self.losses, np.float32)}
 
 
 def quiet(model: Any) -> Any:
+    """Return the model without its logger."""
     model.set_logger(logger.configure(None, []))
     return model
 
@@ -101,7 +103,7 @@ def dqn_updates() -> dict[str, np.ndarray]:
 
 def ppo_epoch() -> dict[str, np.ndarray]:
     model = quiet(PPO("MlpPolicy", environment(), gamma=0.98, n_epochs=1, seed=0, device="cpu"))
-    buffer = play(model)
+    buffer = collect_rollout(model)
     order = np.random.default_rng(0).permutation(model.n_steps)
     recorder = Recorder(model.policy, model.policy.optimizer)
     data = rollout_of(buffer) | {"order": order}
@@ -115,15 +117,15 @@ def a2c_updates() -> dict[str, np.ndarray]:
     recorder = Recorder(model.policy, model.policy.optimizer)
     rollouts = []
     for _ in range(UPDATES):
-        rollouts.append(rollout_of(play(model)))
+        rollouts.append(rollout_of(collect_rollout(model)))
         with recorder.recording():
             model.train()
     data = {name: np.stack([rollout[name] for rollout in rollouts]) for name in rollouts[0]}
     return recorder.arrays(1, UPDATES) | data
 
 
-def play(model: Any) -> Any:
-    """Fill the model's rollout buffer once."""
+def collect_rollout(model: Any) -> Any:
+    """Fill the model's rollout buffer, and return it."""
     if model._last_obs is None:
         _, callback = model._setup_learn(10**6)
         model._callback = callback
@@ -132,7 +134,7 @@ def play(model: Any) -> Any:
 
 
 def rollout_of(buffer: Any) -> dict[str, np.ndarray]:
-    """The rollout of one environment, as it was rollout_with_actions."""
+    """Return the rollout of the first environment, in the order in which it was played."""
     names = ("observations", "actions", "rewards", "values", "log_probs", "advantages", "returns", "episode_starts")
     return {name: getattr(buffer, name)[:, 0].copy() for name in names}
 
@@ -144,41 +146,40 @@ def epsilons(total_steps: int = 1_000_000, points: int = 20) -> dict[str, np.nda
 
 
 def initial_weights(networks: int = 40) -> dict[str, np.ndarray]:
-    """Sorted sample of every layer's weights over many networks."""
-    made: dict[str, list[np.ndarray]] = {}
+    """Return a sorted sample of every layer's weights over many networks."""
+    samples: dict[str, list[np.ndarray]] = {}
     for kind, name in ((DQN, "dqn"), (PPO, "ppo")):
         for seed in range(networks):
-            more = {"buffer_size": 10} if kind is DQN else {}
-            model = kind(
-                "MlpPolicy", environment(), seed=seed, device="cpu", policy_kwargs={"net_arch": [64, 64]}, **more
-            )
+            settings: dict[str, Any] = {"policy_kwargs": {"net_arch": [64, 64]}}
+            settings |= {"buffer_size": 10} if kind is DQN else {}
+            model = kind("MlpPolicy", environment(), seed=seed, device="cpu", **settings)
             module = model.q_net if kind is DQN else model.policy
             for layer, leaf in weights_of(module).items():
-                made.setdefault(f"{name}/{layer}", []).append(leaf.ravel())
+                samples.setdefault(f"{name}/{layer}", []).append(leaf.ravel())
     rng = np.random.default_rng(0)
-    pooled = {name: np.concatenate(leaves) for name, leaves in made.items()}
+    pooled = {name: np.concatenate(leaves) for name, leaves in samples.items()}
     return {name: np.sort(rng.choice(leaf, min(leaf.size, 2000), replace=False)) for name, leaf in pooled.items()}
 
 
 def order_of_events() -> list[tuple[int, str]]:
-    """(environment steps, what happened) around the start of learning and the first copy of the target."""
+    """Return ``(environment steps, event)`` around the start of learning and the first update of the target network."""
     model = quiet(DQN("MlpPolicy", environment(), **TABLE_4, buffer_size=20_000, seed=0, device="cpu"))
     events: list[tuple[int, str]] = []
     train, copy = model.train, sb3_dqn.polyak_update
 
-    def noted_train(*arguments: Any, **named: Any) -> None:
+    def recorded_train(*arguments: Any, **named: Any) -> None:
         events.append((model.num_timesteps, "gradient step"))
         train(*arguments, **named)
 
-    def noted_copy(weights: Any, target: Any, tau: float) -> None:
+    def recorded_copy(weights: Any, target: Any, tau: float) -> None:
         weights = list(weights)
-        if weights:  # not the empty running statistics
+        if weights:  # SB3 also copies the running statistics, which are empty here
             events.append((model.num_timesteps, "target copy"))
         copy(weights, target, tau)
 
-    with mock.patch.object(model, "train", noted_train), mock.patch.object(sb3_dqn, "polyak_update", noted_copy):
+    with mock.patch.object(model, "train", recorded_train), mock.patch.object(sb3_dqn, "polyak_update", recorded_copy):
         model.learn(10_008)
-    return [(step, what) for step, what in events if 100 <= step <= 112 or 9_996 <= step <= 10_008]
+    return [(step, event) for step, event in events if 100 <= step <= 112 or 9_996 <= step <= 10_008]
 
 
 def main() -> None:
@@ -188,18 +189,18 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
     warnings.simplefilter("error")
-    made = {
+    files = {
         "dqn": dqn_updates(),
         "ppo": ppo_epoch(),
         "a2c": a2c_updates(),
         "epsilon": epsilons(),
         "initial": initial_weights(),
     }
-    for name, arrays in made.items():
+    for name, arrays in files.items():
         np.savez_compressed(out / f"{name}.npz", **arrays)
         print(f"{name}: {len(arrays)} arrays, {(out / f'{name}.npz').stat().st_size / 1024:.0f} KiB")
     packages = ("stable-baselines3", "torch", "gymnasium", "numpy", "jax")
-    check_env(environment().unwrapped)  # raises, or warns, if it finds anything
+    check_env(environment().unwrapped)  # raises, or warns, which is an error here
     facts = {
         "check_env": "passed",
         "command": "uv run --group sb3 python experiments/parity_sb3.py --out tests/golden/sb3",

@@ -1,9 +1,10 @@
-"""Statistical parity: our DQN and Stable-Baselines3's on one layout, the same number of seeds and steps each.
+"""Statistical parity: our DQN and that of Stable-Baselines3 on one layout, with as many seeds and steps each.
 
     uv run --group sb3 python experiments/parity_training_sb3.py --out results/parity
 
-Both learn with Table 4 on the layout of seed 0 with 8 powered and 8 connected devices and are then judged greedily on the
-same volume draws. Prints the mean lifetimes with 95 % intervals over the seeds; writes them to parity.json.
+Both train with the settings of Table 4 on the layout of seed 0 with 8 powered and 8 connected devices; then their greedy
+policies are evaluated on the same volume draws. Prints the mean lifetimes with 95 % intervals over the seeds, and writes them
+to parity.json.
 """
 
 import argparse
@@ -12,15 +13,21 @@ import os
 import subprocess
 import sys
 import time
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from reports import write_report
+
 DRAWS = 64
+"""Volume draws of the evaluation."""
+MAX_SLOTS = 64
+"""Longer than any lifetime."""
 
 
 def sb3_worker(seeds: list[int], steps: int) -> None:
-    """Print the mean greedy lifetime of each seed, learned by Stable-Baselines3."""
+    """Train with Stable-Baselines3, and print the mean lifetime of each seed's greedy policy."""
     os.environ["JAX_PLATFORMS"] = "cpu"
     import jax
     import numpy as np
@@ -34,11 +41,11 @@ def sb3_worker(seeds: list[int], steps: int) -> None:
     from uavmec_jax.interop.gymnasium_env import UavMecGymEnv
 
     torch.set_num_threads(1)
-    scenario = make_scenario(layout())
-    params, devices = scenario.params, scenario.layout
-    volumes = np.asarray(jax.vmap(lambda key: volume_table(params, 12, key, 64))(draws()))
-    start = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (DRAWS, *np.shape(leaf))), initial_state(params, devices))
-    step = jax.jit(jax.vmap(lambda state, action, drawn: transition(params, devices, state, action, drawn)))
+    scenario = make_scenario(make_layout())
+    params, layout = scenario.params, scenario.layout
+    volumes = np.asarray(jax.vmap(lambda key: volume_table(params, 12, key, MAX_SLOTS))(evaluation_draws()))
+    start = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (DRAWS, *np.shape(leaf))), initial_state(params, layout))
+    step = jax.jit(jax.vmap(lambda state, action, volumes: transition(params, layout, state, action, volumes)))
     for seed in seeds:
         model = DQN(
             "MlpPolicy", UavMecGymEnv(scenario), learning_rate=0.0071, batch_size=16, gamma=0.98, buffer_size=steps,
@@ -46,32 +53,32 @@ def sb3_worker(seeds: list[int], steps: int) -> None:
         )  # fmt: skip
         model.learn(steps)
         state, length = start, np.zeros(DRAWS, int)
-        for slot in range(64):
-            seen = np.asarray(jax.vmap(observe, (None, None, 0))(params, devices, state))
-            after, outcome = step(state, model.predict(seen, deterministic=True)[0], volumes[:, slot])
+        for slot in range(MAX_SLOTS):
+            observation = np.asarray(jax.vmap(observe, (None, None, 0))(params, layout, state))
+            action, _ = model.predict(observation, deterministic=True)
+            state, outcome = step(state, action, volumes[:, slot])
             length = np.where(length > 0, length, np.where(np.asarray(outcome.cause) != Cause.NONE, slot + 1, 0))
-            state = after
         assert (length > 0).all()
         print(json.dumps({"seed": seed, "lifetime": float(length.mean())}), flush=True)
 
 
-def layout() -> Any:
-    """The one layout: what studies call seed 0 with 8 powered and 8 connected devices."""
+def make_layout() -> Any:
+    """Return the layout that studies have for seed 0 with 8 powered and 8 connected devices."""
     from uavmec_jax.env.params import Params
     from uavmec_jax.scenarios.seeds import layout_for_seed
 
     return layout_for_seed(0, Params(), 8, 8)
 
 
-def draws() -> Any:
-    """The volume draws that both are judged on."""
+def evaluation_draws() -> Any:
+    """Return the volume draws of the evaluation."""
     from uavmec_jax.scenarios.seeds import held_out_draws
 
     return held_out_draws(0, 8, 8, DRAWS)
 
 
 def ours(seeds: int, steps: int) -> list[float]:
-    """Mean greedy lifetime of each seed, learned by this package as one program."""
+    """Train with this package, all seeds as one population, and return the mean lifetime of each greedy policy."""
     import jax
     import jax.numpy as jnp
 
@@ -79,38 +86,41 @@ def ours(seeds: int, steps: int) -> list[float]:
     from uavmec_jax.agents.algorithm import Agent
     from uavmec_jax.env.rollout import rollouts
     from uavmec_jax.env.scenario import make_scenario
-    from uavmec_jax.training import host, population
+    from uavmec_jax.training import host
     from uavmec_jax.training.partition import partition_population
+    from uavmec_jax.training.population import train_population
     from uavmec_jax.training.training import Validation
 
     host.use_all_cores()
-    algorithm = dqn.algorithm(dqn.DQNSpec(total_steps=steps))
-    alone = Agent(key=jax.random.key(0), scenario=make_scenario(layout()), hyper=dqn.DQNHyper())
-    agents = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (seeds, *jnp.shape(leaf))), alone)
+    algorithm, hyper = dqn.algorithm(dqn.DQNSpec(total_steps=steps)), dqn.DQNHyper()
+    scenario = make_scenario(make_layout())
+    agent = Agent(key=jax.random.key(0), scenario=scenario, hyper=hyper)
+    agents = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (seeds, *jnp.shape(leaf))), agent)
     agents = agents.replace(key=jax.random.split(jax.random.key(1), seeds))
-    blocks = partition_population(seeds, algorithm.agent_bytes, host.free_memory())
     keys = jax.random.split(jax.random.key(2), (seeds, 1))
-    lifetimes: list[float] = []
-    for block in population.train(algorithm, agents, keys, validation=Validation(every=steps, draws=1), blocks=blocks):
-        judged = jax.jit(jax.vmap(
-            lambda weights: rollouts(
-                algorithm.policy(dqn.DQNHyper(), weights), alone.scenario.params, alone.scenario.layout, draws()
-            ).length.mean()
-        ))(block.last)  # fmt: skip
-        lifetimes += judged.tolist()
-    return lifetimes
+    partition = partition_population(seeds, algorithm.agent_bytes, host.free_memory())
+    validation = Validation(every=steps, draws=1)
+
+    @jax.jit
+    @jax.vmap
+    def mean_lifetime(weights: Any) -> jax.Array:
+        policy = algorithm.policy(hyper, weights)
+        return rollouts(policy, scenario.params, scenario.layout, evaluation_draws()).length.mean()
+
+    shards = train_population(algorithm, agents, keys, validation=validation, partition=partition)
+    return [lifetime for shard in shards for lifetime in mean_lifetime(shard.last).tolist()]
 
 
 def theirs(seeds: int, steps: int, processes: int) -> list[float]:
-    """The same by Stable-Baselines3, the seeds dealt out to processes."""
+    """Train with Stable-Baselines3, the seeds spread over processes, and return the mean lifetime of each greedy policy."""
     running = []
     for worker in range(processes):
-        own = [str(seed) for seed in range(worker, seeds, processes)]
-        command = [sys.executable, __file__, "--sb3-worker", *own, "--steps", str(steps)]
+        chosen = [str(seed) for seed in range(worker, seeds, processes)]
+        command = [sys.executable, __file__, "--sb3-worker", *chosen, "--steps", str(steps)]
         running.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
     lines = [line for process in running for line in process.communicate()[0].splitlines()]
-    found = {row["seed"]: row["lifetime"] for row in map(json.loads, lines)}
-    return [found[seed] for seed in range(seeds)]
+    lifetimes = {row["seed"]: row["lifetime"] for row in map(json.loads, lines)}
+    return [lifetimes[seed] for seed in range(seeds)]
 
 
 def main() -> None:
@@ -129,9 +139,9 @@ def main() -> None:
     report: dict = {"command": " ".join(["python", *sys.argv]), "seeds": arguments.seeds, "steps": arguments.steps}
     report["versions"] = {name: metadata.version(name) for name in ("uavmec-jax", "stable-baselines3", "torch", "jax")}
     intervals = []
-    for name, play in (("stable_baselines3", lambda *a: theirs(*a, arguments.processes)), ("uavmec_jax", ours)):
+    for name, train in (("stable_baselines3", partial(theirs, processes=arguments.processes)), ("uavmec_jax", ours)):
         tick = time.perf_counter()
-        lifetimes = play(arguments.seeds, arguments.steps)
+        lifetimes = train(arguments.seeds, arguments.steps)
         seconds = time.perf_counter() - tick
         from uavmec_jax.studies.statistics import mean_interval
 
@@ -143,8 +153,7 @@ def main() -> None:
     report["intervals_overlap"] = bool(low_a <= high_b and low_b <= high_a)
     print(f"the intervals {'overlap' if report['intervals_overlap'] else 'do not overlap'}")
     if arguments.out:
-        arguments.out.mkdir(parents=True, exist_ok=True)
-        (arguments.out / "parity.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        write_report(arguments.out / "parity.json", report)
 
 
 if __name__ == "__main__":

@@ -1,32 +1,29 @@
-"""Train the generalist and put it into the package: `um.load_policy("generalist")` is then what this run has learned.
+"""Train the generalist and put it into the package, where `um.load_policy("generalist")` loads it.
 
     uv run python experiments/ship_generalist.py [--run runs/generalist] [--into FILE]
 
-Runs the study `generalist` (or goes on with the run that is there), takes the agent that was best on the validation
-scenarios, and writes its best weights with all that makes them a policy. `uavmec_jax/studies/library/generalist.md` is the
-model card.
+Runs the study `generalist`, or resumes its run, takes the agent that is best on the validation scenarios, and writes its best
+weights as a policy file. Its model card is `uavmec_jax/scenarios/library/generalist.md`.
 """
 
 import argparse
 from pathlib import Path
 
-from uavmec_jax.training import host
-
-host.use_all_cores()
-
 from uavmec_jax.runs.run import run_or_resume
 from uavmec_jax.scenarios.policies import TrainedPolicy, load_policy
 from uavmec_jax.studies.study import load_study
+from uavmec_jax.training import host
 
-PACKAGED = Path(__file__).parents[1] / "uavmec_jax" / "studies" / "library" / "generalist.npz"
+SHIPPED = Path(__file__).parents[1] / "uavmec_jax" / "scenarios" / "library" / "generalist.npz"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--run", type=Path, default=Path("runs/generalist"), help="folder of the run")
-    parser.add_argument("--into", type=Path, default=PACKAGED, help="file that is written")
+    parser.add_argument("--into", type=Path, default=SHIPPED, help="policy file that is written")
     parser.add_argument("--steps", type=int, help="environment steps of one agent (default: the study's)")
     arguments = parser.parse_args()
+    host.use_all_cores()
 
     study = load_study("generalist", {"steps": arguments.steps} if arguments.steps else {})
     results = run_or_resume(study, arguments.run, command="uv run python experiments/ship_generalist.py")

@@ -8,4 +8,4 @@ The same as `uavmec run table6`.
 from table5_grid import run
 
 if __name__ == "__main__":
-    run("table6", seeds=5, about=__doc__)
+    run("table6", seeds=5, description=__doc__)

@@ -1,9 +1,9 @@
-"""A learner of another library on this environment: PPO of rejax, through the five-value adapter.
+"""An algorithm of another library on this environment: PPO of rejax, through the five-value adapter.
 
     uv run --group rejax python experiments/train_with_rejax.py --out results/rejax
 
 Trains on one layout with 8 powered and 8 connected devices and prints the greedy policy's lifetime beside oldest-first's.
-rejax (https://github.com/keraJLi/rejax) still speaks the step of gymnax 0.0.9, which FiveValueEnv gives it.
+rejax (https://github.com/keraJLi/rejax) expects the step of gymnax 0.0.9, which FiveValueEnv has.
 """
 
 import argparse
@@ -16,6 +16,7 @@ from pathlib import Path
 import jax
 import rejax
 from rejax.evaluate import evaluate
+from reports import write_report
 
 from uavmec_jax.env.rollout import rollouts
 from uavmec_jax.env.scenario import make_scenario
@@ -32,7 +33,7 @@ def main() -> None:
     arguments = parser.parse_args()
     scenario = make_scenario()
     env, params = FiveValueEnv(), FiveValueParams(scenario=scenario)
-    learner = rejax.get_algo("ppo").create(
+    algorithm = rejax.get_algo("ppo").create(
         env=env, env_params=params, total_timesteps=arguments.steps, eval_freq=arguments.steps, gamma=0.98,
         learning_rate=3e-4, num_envs=16, num_steps=128, num_epochs=10, num_minibatches=32, gae_lambda=0.95,
         clip_eps=0.2, ent_coef=0.0, vf_coef=0.5, max_grad_norm=0.5, skip_initial_evaluation=True,
@@ -40,11 +41,11 @@ def main() -> None:
     )  # fmt: skip
     tick = time.perf_counter()
     keys = jax.random.split(jax.random.key(0), arguments.seeds)
-    state, _ = jax.block_until_ready(jax.jit(jax.vmap(learner.train))(keys))
+    state, _ = jax.block_until_ready(jax.jit(jax.vmap(algorithm.train))(keys))
     seconds = time.perf_counter() - tick
     lifetimes = []
     for seed in range(arguments.seeds):
-        act = learner.make_act(jax.tree.map(lambda leaf, seed=seed: leaf[seed], state))
+        act = algorithm.make_act(jax.tree.map(lambda leaf, seed=seed: leaf[seed], state))
         lengths, _ = evaluate(act, jax.random.key(1), env, params, 64, params.max_steps_in_episode)
         lifetimes.append(float(lengths.mean()))
     draws = jax.random.split(jax.random.key(1), 64)
@@ -60,8 +61,7 @@ def main() -> None:
     }
     print(json.dumps(report, indent=1))
     if arguments.out:
-        arguments.out.mkdir(parents=True, exist_ok=True)
-        (arguments.out / "rejax.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        write_report(arguments.out / "rejax.json", report)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The helpers beside the scripts are importable, as they are for a script that Python runs."""
+"""Make the modules beside the scripts importable, as they are when Python runs a script."""
 
 import sys
 

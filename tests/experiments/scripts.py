@@ -1,4 +1,4 @@
-"""Run an experiment script of the clone, small."""
+"""Running the experiment scripts of the clone."""
 
 import subprocess
 import sys
@@ -8,7 +8,8 @@ EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 
 
 def run(script, *arguments):
+    """Run a script, and return its output."""
     command = [sys.executable, EXPERIMENTS / script, *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=500)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    process = subprocess.run(command, capture_output=True, text=True, timeout=500)
+    assert process.returncode == 0, process.stderr
+    return process.stdout

@@ -1,4 +1,4 @@
-"""The benchmarks run from the clone, small."""
+"""The benchmarks run, at small sizes."""
 
 import json
 
@@ -12,8 +12,8 @@ pytestmark = pytest.mark.slow
 def test_benchmark_on_policy(tmp_path):
     run("benchmark_on_policy.py", "--seconds", 0.1, "--agents", 2, "--out", tmp_path)
     report = json.loads((tmp_path / "benchmark_on_policy.json").read_text())
-    found = [(row["algorithm"], row["agents"], row["n_envs"]) for row in report["training"]]
-    assert found == [("ppo", 2, 1), ("ppo", 8, 16), ("a2c", 2, 1), ("a2c", 8, 16)]
+    rows = [(row["algorithm"], row["agents"], row["n_envs"]) for row in report["training"]]
+    assert rows == [("ppo", 2, 1), ("ppo", 8, 16), ("a2c", 2, 1), ("a2c", 8, 16)]
     assert all(row["steps_per_second"] > 0 for row in report["training"])
 
 
@@ -45,7 +45,7 @@ def test_benchmark_accelerator(tmp_path):
 
 def test_simulation_against_a_run(tmp_path):
     settings = ("algorithm=none", "axes.seeds=1", "axes.powered=[8]", "evaluation.draws=2", "evaluation.planners=[]")
-    options = ["--study", "planning", *(part for one in settings for part in ("--set", one))]
+    options = ["--study", "planning", *(part for setting in settings for part in ("--set", setting))]
     out = run("simulation_against_a_run.py", *options, "--out", tmp_path / "run")
     assert "wall time" in out
     report = json.loads((tmp_path / "run" / "simulation.json").read_text())

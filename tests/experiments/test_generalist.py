@@ -1,4 +1,4 @@
-"""The scripts about the generalist run from the clone, small."""
+"""The scripts about the generalist run, at small sizes."""
 
 import json
 
@@ -11,7 +11,7 @@ pytestmark = pytest.mark.slow
 
 
 def test_generalist_training(tmp_path):
-    run("generalist_training.py", "--scenarios", 8, "--epochs", 1, "--steps", 16_384, "--towns", 1, "--out", tmp_path)
+    run("generalist_training.py", "--scenarios", 8, "--epochs", 1, "--steps", 16_384, "--layouts", 1, "--out", tmp_path)
     report = json.loads((tmp_path / "training.json").read_text())
     assert len(report["ppo"]["slots"]) == len(report["ppo"]["seconds"]) == 1
     assert report["imitation_then_ppo"]["seconds"][0] > report["beam"]["seconds"]
@@ -19,8 +19,18 @@ def test_generalist_training(tmp_path):
     assert (tmp_path / "training.png").stat().st_size > 20_000
 
 
+def test_generalist_grid(tmp_path):
+    run("generalist_grid.py", "--layouts", 1, "--samples", 4, "--out", tmp_path)
+    report = json.loads((tmp_path / "grid.json").read_text())
+    assert report["first_failure"]["episodes"] == 25 * report["draws"]
+    assert report["mean_slots"]["oldest_first"] < report["mean_slots"]["generalist"] < report["mean_slots"]["bound"]
+    assert report["beside_the_dqn"]["mean_slots"]["dqn_best"] > 10
+    for figure in ("ratios.png", "reliability.png"):
+        assert (tmp_path / figure).stat().st_size > 10_000
+
+
 def test_generalist_planners(tmp_path):
-    run("generalist_planners.py", "--towns", 1, "--widths", 2, "--out", tmp_path)
+    run("generalist_planners.py", "--layouts", 1, "--widths", 2, "--out", tmp_path)
     report = json.loads((tmp_path / "planners.json").read_text())
     assert report["episodes"] == 25
     assert set(report["mean_slots"]) == set(report["seconds"])
@@ -28,8 +38,8 @@ def test_generalist_planners(tmp_path):
 
 
 def test_generalist_elsewhere_and_speed(tmp_path):
-    few = ("--towns", 2, "--draws", 1, "--only", "6 devices", "48 devices", "round_lake")
-    out = run("generalist_elsewhere.py", *few, "--out", tmp_path)
+    small = ("--layouts", 2, "--draws", 1, "--only", "6 devices", "48 devices", "round_lake")
+    out = run("generalist_elsewhere.py", *small, "--out", tmp_path)
     assert "48 devices" in out
     assert "random weights" in out
     assert (tmp_path / "traffic.png").exists()
@@ -39,6 +49,6 @@ def test_generalist_elsewhere_and_speed(tmp_path):
 
 
 def test_ship_generalist(tmp_path):
-    out = run("ship_generalist.py", "--run", tmp_path / "run", "--into", tmp_path / "mine.npz", "--steps", 16_384)
-    assert "mine.npz" in out
-    assert load_policy(tmp_path / "mine.npz").n_devices is None
+    out = run("ship_generalist.py", "--run", tmp_path / "run", "--into", tmp_path / "policy.npz", "--steps", 16_384)
+    assert "policy.npz" in out
+    assert load_policy(tmp_path / "policy.npz").n_devices is None

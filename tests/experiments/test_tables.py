@@ -1,4 +1,4 @@
-"""The scripts of the paper's tables and figures run from the clone, small."""
+"""The scripts of the paper's tables and figures run, at small sizes."""
 
 import pytest
 

@@ -108,7 +108,7 @@ BAD = [
     (["--set", "uav_speed_m_s=0.0"], "--set: uav_speed_m_s is 0.0; it should be greater than 0"),
     (["--set", "device_battery_range_j=[8e4,5e4]"], "--set: device_battery_range_j is [80000.0, 50000.0]; give"),
     (["none.toml"], "none.toml: cannot be read: No such file"),
-    ([str(EXAMPLES / "village.csv"), "--powered", "3"], "says itself which devices have power"),
+    ([str(EXAMPLES / "village.csv"), "--powered", "3"], "says which devices have power"),
     (
         [str(EXAMPLES / "village.csv"), "--set", "uav_battery_j=1000.0"],
         "the hop from the start to church, 361 m, takes 11",
