@@ -30,7 +30,7 @@ def train_speed(n_agents: int, seconds: float) -> dict:
     import jax
     import jax.numpy as jnp
 
-    from uavmec_jax.runs.speed import training_speed
+    from training_speed import training_speed
     from uavmec_jax.studies.study import parse_study
 
     axes = f"[axes]\npowered = [8]\nconnected = [8]\nseeds = {n_agents}"
@@ -161,7 +161,7 @@ def main() -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from uavmec_jax.runs.speed import environment_speed
+    from uavmec_jax.training.environment_speed import environment_speed
     from uavmec_jax.training.partition import AGENTS_PER_CORE
 
     facts = host.describe()

@@ -13,7 +13,7 @@ def doctor(as_json: bool) -> None:
     from uavmec_jax.training import host
 
     host.use_all_cores()
-    from uavmec_jax.runs.speed import environment_speed
+    from uavmec_jax.training.environment_speed import environment_speed
 
     facts = host.describe() | {"environment_steps_per_second": round(environment_speed(seconds=2.0))}
     facts["versions"]["libsumo"] = host.version("libsumo")
