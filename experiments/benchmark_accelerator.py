@@ -15,9 +15,9 @@ from reports import write_report
 
 from uavmec_jax.reporting import canvas, figures
 from uavmec_jax.runs.run import run_or_resume
-from uavmec_jax.training.environment_speed import environment_speed
 from uavmec_jax.studies.study import load_study
 from uavmec_jax.training import host
+from uavmec_jax.training.environment_speed import environment_speed
 
 POPULATIONS = (75, 750, 7500)
 """Numbers of agents that train together."""

@@ -29,8 +29,8 @@ def train_speed(n_agents: int, seconds: float) -> dict:
     """Measure the environment steps/s of training with ``n_agents`` agents and filled replay buffers."""
     import jax
     import jax.numpy as jnp
-
     from training_speed import training_speed
+
     from uavmec_jax.studies.study import parse_study
 
     axes = f"[axes]\npowered = [8]\nconnected = [8]\nseeds = {n_agents}"

@@ -23,6 +23,7 @@ POPULATIONS = (1, 8, 75, 300)
 def train_speed(algorithm: str, n_agents: int, seconds: float, n_envs: int = 1) -> dict:
     """Measure the environment steps/s of training with ``n_agents`` agents of ``n_envs`` environments each."""
     from training_speed import training_speed
+
     from uavmec_jax.studies.study import parse_study
 
     axes = f"[axes]\npowered = [8]\nconnected = [8]\nseeds = {n_agents}"
