@@ -1,12 +1,13 @@
 """Advice for the next slot: which device to visit, what to expect then, and what a repair would bring.
 
-It is the rollout planner's step (:mod:`uavmec_jax.planning.rollout_planner`) with so many futures that their distribution is
-worth reporting.
+The method is one step of the rollout planner (:mod:`uavmec_jax.planning.rollout_planner`), with so many futures that the
+distribution of their outcomes is worth reporting.
 """
 
 from dataclasses import dataclass
 from functools import partial
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +19,7 @@ from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Episode, Policy, rollout_from
 from uavmec_jax.planning.changes import WhatIf, every_change, rank_changes
 from uavmec_jax.planning.forecast import SAMPLES, Forecast
-from uavmec_jax.planning.rollout_planner import best_candidate, try_candidates
+from uavmec_jax.planning.rollout_planner import prefer, try_candidates
 
 
 @dataclass(frozen=True)
@@ -27,10 +28,10 @@ class Candidate:
 
     Attributes:
         device: index from 0.
-        lifetime: slots, mean over the futures in which it is visited next and the policy goes on.
-        behind: slots by which the best candidate is worth more on the same futures. A future is worth its lifetime, less
-            the price of the first failure where the layout's traffic has one.
-        behind_low, behind_high: 95 % interval of that difference over the futures.
+        lifetime: slots, mean over the futures if the device is visited next and the policy decides from then on.
+        behind: slots by which the best candidate's value exceeds this one's on the same futures. The value of a future is
+            its lifetime minus the price of its first failure, if the layout's traffic has prices.
+        behind_low, behind_high: 95 % confidence interval of that difference over the futures.
     """
 
     device: int
@@ -47,8 +48,8 @@ class Advice:
     Attributes:
         candidates: every device, the best first.
         policy_choice: index of the device that the policy itself would visit.
-        forecast: if the best candidate is visited next.
-        what_if: every repair and removal of one device, the most useful first; empty if not asked for.
+        forecast: the forecast if the best candidate is visited next.
+        what_if: every repair and removal of one device, the largest gain first; empty if not asked for.
     """
 
     candidates: tuple[Candidate, ...]
@@ -72,9 +73,9 @@ def advise(
     samples: int = SAMPLES,
     what_if: bool = False,
 ) -> Advice:
-    """Recommend the next visit: the one after which lifetimes, less the price of the first failure, are longest.
+    """Recommend the next visit: the one with the highest mean lifetime minus the price of the first failure.
 
-    It is compiled once for a policy and a number of devices.
+    The simulation is compiled once per policy, number of devices and number of futures.
 
     Args:
         policy: decides after the next visit: a trained policy (:func:`um.load_policy`) or a heuristic.
@@ -86,12 +87,13 @@ def advise(
         what_if: whether to try every repair and removal too.
     """
     state = initial_state(params, layout) if state is None else state
+    chex.assert_equal_shape([state.battery, state.age, layout.capacity])
     futures = jax.random.split(jax.random.key(0) if key is None else key, samples)
     choice, episodes = _try_candidates(policy, params, layout, state, futures)
     lifetimes = np.asarray(episodes.length, float)
     price = np.asarray(layout.failure_price(state.elapsed))
     value = lifetimes - np.asarray(episodes.first_failure) @ price
-    best = int(best_candidate(value.mean(axis=1), int(choice)))
+    best = int(np.argmax(prefer(int(choice), value.mean(axis=1))))
     return Advice(
         candidates=_rank(lifetimes, value, best),
         policy_choice=int(choice),
@@ -104,14 +106,14 @@ def advise(
 def _try_candidates(
     policy: Policy, params: Params, layout: Layout, state: State, futures: Key[Array, " S"]
 ) -> tuple[Int[Array, ""], Episode]:
-    """The policy's own choice, and the episodes of every candidate, leaves ``[n, S, ...]``."""
+    """Return the policy's own choice, and the episodes of every candidate, leaves ``[n, S, ...]``."""
     return policy(params, layout, state, futures[0]), try_candidates(policy, params, layout, state, futures)
 
 
 def _try_changes(
     policy: Policy, params: Params, layout: Layout, state: State, futures: Key[Array, " S"]
 ) -> tuple[WhatIf, ...]:
-    """Every change of one device, with the policy deciding from the present state on."""
+    """Return the effect of every change of one device if the policy decides from the present state on."""
     layouts = jax.tree.map(lambda *leaves: jnp.stack(leaves), layout, *every_change(layout))
     lifetimes = np.asarray(_lifetimes(policy, params, layouts, state, futures))
     return rank_changes(layout, lifetimes[1:], lifetimes[0])
@@ -121,23 +123,24 @@ def _try_changes(
 def _lifetimes(
     policy: Policy, params: Params, layouts: Layout, state: State, futures: Key[Array, " S"]
 ) -> Int[Array, "L S"]:
-    one = lambda layout, future: rollout_from(policy, params, layout, state, future).length  # noqa: E731
-    return jax.vmap(jax.vmap(one, (None, 0)), (0, None))(layouts, futures)
+    """Return the lifetime in every future for each of ``L`` layouts."""
+    lifetime = lambda layout, future: rollout_from(policy, params, layout, state, future).length  # noqa: E731
+    return jax.vmap(jax.vmap(lifetime, (None, 0)), (0, None))(layouts, futures)
 
 
 def _rank(lifetimes: Float[np.ndarray, "n S"], value: Float[np.ndarray, "n S"], best: int) -> tuple[Candidate, ...]:
-    """The candidates, ``best`` first, then by their mean value."""
+    """Return the candidates, ``best`` first, then in descending order of their mean value."""
     behind = value[best] - value
     futures = value.shape[1]
-    half = 1.96 * behind.std(axis=1, ddof=min(1, futures - 1)) / np.sqrt(futures)
+    half_width = 1.96 * behind.std(axis=1, ddof=min(1, futures - 1)) / np.sqrt(futures)
     order = sorted(range(len(value)), key=lambda device: (device != best, -value[device].mean(), device))
     return tuple(
         Candidate(
             device=device,
             lifetime=float(lifetimes[device].mean()),
             behind=float(behind[device].mean()),
-            behind_low=float(behind[device].mean() - half[device]),
-            behind_high=float(behind[device].mean() + half[device]),
+            behind_low=float(behind[device].mean() - half_width[device]),
+            behind_high=float(behind[device].mean() + half_width[device]),
         )
         for device in order
     )

@@ -1,10 +1,10 @@
-"""What a crew could do about one device: repair its power, repair its communication, or take it away."""
+"""What-if changes of one device: repair its power, repair its communication, or remove it."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int
 
 from uavmec_jax.env.layout import Layout
 
@@ -13,13 +13,13 @@ CHANGES = ("repair power", "repair comms", "remove")
 
 @dataclass(frozen=True)
 class WhatIf:
-    """What changing one device would bring.
+    """The effect of changing one device.
 
     Attributes:
         device: index from 0.
         change: one of :data:`CHANGES`.
-        lifetime: slots, mean over the draws.
-        gain: slots more than without the change, on the same draws.
+        lifetime: slots with the change, mean over the draws.
+        gain: slots gained by the change, mean over the same draws.
     """
 
     device: int
@@ -29,14 +29,14 @@ class WhatIf:
 
 
 def every_change(layout: Layout) -> list[Layout]:
-    """The layout after each change of each device, change by change."""
+    """Return the layouts after each change of each device, change by change."""
     return [changed(layout, device, change) for change in CHANGES for device in range(layout.capacity.shape[0])]
 
 
 def changed(layout: Layout, device: int, change: str) -> Layout:
-    """The layout after one change.
+    """Return the layout after one change.
 
-    A device that is removed lacks nothing any more, has no work, and its hover point moves to that of another device.
+    A removed device stays in the arrays: it lacks nothing, has no work, and its hover point becomes that of a neighbour.
     """
     if change == "repair power":
         return replace(layout, has_power=layout.has_power.at[device].set(True))
@@ -53,20 +53,25 @@ def changed(layout: Layout, device: int, change: str) -> Layout:
     )
 
 
-def rank_changes(layout: Layout, lives: Any, now: Any) -> tuple[WhatIf, ...]:
-    """The changes that make sense, the most useful first.
+def rank_changes(
+    layout: Layout, lifetimes: Int[np.ndarray, "changes D"], unchanged: Int[np.ndarray, " D"]
+) -> tuple[WhatIf, ...]:
+    """Return the effects of the changes that repair what a device lacks or remove it, the largest gain first.
 
     Args:
-        layout: as it is.
-        lives: ``[3 * n, D]`` slots with each of :func:`every_change`.
-        now: ``[D]`` slots without, on the same draws.
+        layout: without any change.
+        lifetimes: ``[3 * n, D]`` slots on each draw after each of :func:`every_change`.
+        unchanged: ``[D]`` slots on the same draws without any change.
     """
-    lives = np.asarray(lives).reshape(len(CHANGES), -1, len(now))
-    lacks = {"repair power": ~np.asarray(layout.has_power), "repair comms": ~np.asarray(layout.has_comms)}
-    found = [
-        WhatIf(device, change, float(lives[row, device].mean()), float((lives[row, device] - now).mean()))
-        for row, change in enumerate(CHANGES)
-        for device in range(lives.shape[1])
-        if change == "remove" or lacks[change][device]
+    by_device = lifetimes.reshape(len(CHANGES), -1, len(unchanged))
+    applies = {
+        "repair power": ~np.asarray(layout.has_power),
+        "repair comms": ~np.asarray(layout.has_comms),
+        "remove": np.ones(by_device.shape[1], bool),
+    }
+    effects = [
+        WhatIf(device, change, float(after[device].mean()), float((after[device] - unchanged).mean()))
+        for change, after in zip(CHANGES, by_device, strict=True)
+        for device in np.flatnonzero(applies[change]).tolist()
     ]
-    return tuple(sorted(found, key=lambda one: (-one.gain, CHANGES.index(one.change), one.device)))
+    return tuple(sorted(effects, key=lambda effect: (-effect.gain, CHANGES.index(effect.change), effect.device)))

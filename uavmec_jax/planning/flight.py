@@ -1,71 +1,86 @@
-"""The least that a UAV must fly to keep data fresh: shortest rounds through the devices without communication.
+"""A lower bound on the distance that a UAV must fly to keep data fresh.
 
-Data expire after E slots without service, so any E slots in a row contain a visit to each of these devices. The first
-round (a visit to each) is thus complete by slot E at the latest. It ends at some device at the slot of that device's
-visit, and the E slots from there on contain a visit to each again: every E - 1 further slots hold one more round, which
-starts where the last one ended. A round is at least as long as the shortest path through hover points that serve all
-these devices (a generalised travelling-salesman path, exact by the dynamic programme of Bellman 1962 and of Held and
-Karp 1962), and rounds are chained over their end points.
+Let E be the number of slots after which the data of an unserved device expire. While no data expire, any E consecutive
+slots contain a visit to each device without communication. Call a sequence of flights that visits all of them a *round*.
+The first round is therefore complete by slot E at the latest. It ends with the first visit to some device, and the E slots
+that begin with this visit again contain a visit to each device; hence every E - 1 further slots hold one more round, which
+starts where the previous one ended.
+
+A round is at least as long as the shortest path through hover points that cover all these devices. This is a generalised
+travelling-salesman path; it is computed exactly by the dynamic programme of Bellman (1962) and of Held and Karp (1962). The
+bound chains shortest rounds over their end points.
 """
 
 from functools import cached_property
 
 import numpy as np
+from jaxtyping import Bool, Float
 
-MOST_DEVICES = 10
-"""Rounds are computed exactly for at most this many devices (``2**MOST_DEVICES`` subsets)."""
+MAX_ROUND_DEVICES = 10
+"""Devices up to which rounds are computed exactly, over ``2**MAX_ROUND_DEVICES`` subsets."""
 
 
 class Rounds:
-    """Shortest rounds of one layout.
+    """Shortest rounds of one layout through its devices without communication.
 
     Args:
         position: ``[n, 2]`` m; the UAV starts at the origin.
-        covers: ``[n, n]`` bool, ``covers[a, d]``: hovering above a serves d.
-        calls: ``[n]`` bool, devices whose data expire. Of more than :data:`MOST_DEVICES` the first ones are considered;
-            a round through fewer devices is no longer, so the bound holds.
-        to_expiry: slots E without service after which data have expired.
+        covers: ``[n, n]`` bool, ``covers[a, d]``: a UAV hovering above ``a`` serves ``d``.
+        disconnected: ``[n]`` bool, the devices without communication. Only the first :data:`MAX_ROUND_DEVICES` of them
+            are considered; a round through fewer devices is no longer, so the bound remains valid.
+        slots_to_expiry: slots without service after which data have expired (E above).
     """
 
-    def __init__(self, position: np.ndarray, covers: np.ndarray, calls: np.ndarray, to_expiry: int) -> None:
-        called = np.flatnonzero(calls)[:MOST_DEVICES]
-        serves = covers[:, called].astype(int) @ (1 << np.arange(len(called)))
-        hover = np.flatnonzero(serves)
-        self._serves, self._everyone = serves[hover], (1 << len(called)) - 1
+    def __init__(
+        self,
+        position: Float[np.ndarray, "n 2"],
+        covers: Bool[np.ndarray, "n n"],
+        disconnected: Bool[np.ndarray, " n"],
+        slots_to_expiry: int,
+    ) -> None:
+        devices = np.flatnonzero(disconnected)[:MAX_ROUND_DEVICES]
+        subsets = covers[:, devices].astype(int) @ (1 << np.arange(len(devices)))
+        hover = np.flatnonzero(subsets)
+        # Sets of devices are bit masks: the devices served from each of the q useful hover points, and all devices.
+        self._served, self._all = subsets[hover], (1 << len(devices)) - 1
         self._from_start = np.linalg.norm(position[hover], axis=-1)
-        self._apart = np.linalg.norm(position[hover, None] - position[None, hover], axis=-1)
+        self._distance = np.linalg.norm(position[hover, None] - position[None, hover], axis=-1)
         self._nearest = float(np.linalg.norm(position, axis=-1).min())
-        self._to_expiry = to_expiry
+        self._slots_to_expiry = slots_to_expiry
 
-    def least_flight(self, slots: int) -> float:
-        """Metres that the UAV flies at least while no data expire for ``slots`` slots (one slot more is started)."""
-        if not self._everyone or slots < self._to_expiry:
+    def min_distance(self, slots: int) -> float:
+        """Return the least distance in m that the UAV flies if no data expire for ``slots`` slots and one more starts."""
+        if not self._all or slots < self._slots_to_expiry:
             return self._nearest
-        flown = self._first
-        for _ in range((slots - self._to_expiry) // max(self._to_expiry - 1, 1)):
-            flown = np.min(flown[:, None] + self._further, axis=0)
-        return float(flown.min())
+        distance = self._first
+        for _ in range((slots - self._slots_to_expiry) // max(self._slots_to_expiry - 1, 1)):
+            distance = np.min(distance[:, None] + self._next, axis=0)
+        return float(distance.min())
 
     @cached_property
-    def _first(self) -> np.ndarray:
-        """``[q]`` m, shortest first round that ends above each hover point."""
-        return self._paths(self._from_start[None])[0]
+    def _first(self) -> Float[np.ndarray, " q"]:
+        """Length in m of the shortest first round that ends at each hover point."""
+        return self._shortest_paths(self._from_start[None])[0]
 
     @cached_property
-    def _further(self) -> np.ndarray:
-        """``[q, q]`` m, shortest round that starts above one hover point and ends above another."""
-        start = np.full((len(self._serves),) * 2, np.inf)
+    def _next(self) -> Float[np.ndarray, "q q"]:
+        """Length in m of the shortest later round from one hover point to another."""
+        start = np.full((len(self._served),) * 2, np.inf)
         np.fill_diagonal(start, 0.0)
-        return self._paths(start)
+        return self._shortest_paths(start)
 
-    def _paths(self, start: np.ndarray) -> np.ndarray:
-        """``[B, q]`` m, shortest paths that serve everyone, from ``start [B, q]`` (metres to the first hover point)."""
-        flown = np.full((len(start), self._everyone + 1, len(self._serves)), np.inf)
-        for hover, serves in enumerate(self._serves):
-            flown[:, serves, hover] = np.minimum(flown[:, serves, hover], start[:, hover])
-        for done in range(1, self._everyone):
-            onward = np.min(flown[:, done, :, None] + self._apart, axis=1)
-            for hover, serves in enumerate(self._serves):
-                if (more := done | serves) != done:
-                    flown[:, more, hover] = np.minimum(flown[:, more, hover], onward[:, hover])
-        return flown[:, self._everyone]
+    def _shortest_paths(self, start: Float[np.ndarray, "B q"]) -> Float[np.ndarray, "B q"]:
+        """Return the lengths in m of the shortest paths that serve all devices and end at each hover point.
+
+        Args:
+            start: m, distance at which each path reaches each hover point if that is its first.
+        """
+        length = np.full((len(start), self._all + 1, len(self._served)), np.inf)
+        for hover, served in enumerate(self._served):
+            length[:, served, hover] = np.minimum(length[:, served, hover], start[:, hover])
+        for done in range(1, self._all):
+            onward = np.min(length[:, done, :, None] + self._distance, axis=1)
+            for hover, served in enumerate(self._served):
+                if (union := done | served) != done:
+                    length[:, union, hover] = np.minimum(length[:, union, hover], onward[:, hover])
+        return length[:, self._all]

@@ -1,4 +1,4 @@
-"""Forecasts: how long a network lives under a policy, which device fails first and when, and what ends it."""
+"""Forecasts: how long a network lives under a policy, which device fails first and when, and what ends the episode."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from functools import partial
 
 import jax
 import numpy as np
-from jaxtyping import Array, Key
+from jaxtyping import Array, Float, Int, Key
 
 from uavmec_jax.env.dynamics import Cause, State, initial_state
 from uavmec_jax.env.layout import Layout
@@ -14,30 +14,30 @@ from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Episode, Policy, rollout_from
 
 SAMPLES = 256
-"""Futures that a forecast averages by default."""
+"""Futures simulated for a forecast by default."""
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """Statistics of ``S`` episodes of one scenario, played to their end with different task volumes.
+    """Statistics of ``S`` episodes of one scenario, simulated to their end with different task volumes.
 
     Attributes:
-        lifetimes: ``[S]`` int slots, counted from the first slot on: those already survived are included.
-        first_failure: ``[n]`` probability that each device is the first to fail; the rest is that no device fails.
-        failure_slot: ``[n]`` slot in which each device fails, mean over the episodes in which it fails first; NaN if
-            it never does.
-        causes: share of the episodes that end by each :class:`Cause`; causes that never occur are left out.
+        lifetimes: ``[S]`` slots, counted from the first slot of the scenario: those already survived are included.
+        first_failure: ``[n]`` probability that each device is the first to fail; they sum to 1 minus :attr:`no_failure`.
+        failure_slot: ``[n]`` slot in which each device fails, mean over the episodes in which it is the first; NaN if
+            it never is.
+        causes: share of the episodes that each :class:`Cause` ends; causes that do not occur are left out.
     """
 
-    lifetimes: np.ndarray
-    first_failure: np.ndarray
-    failure_slot: np.ndarray
+    lifetimes: Int[np.ndarray, " S"]
+    first_failure: Float[np.ndarray, " n"]
+    failure_slot: Float[np.ndarray, " n"]
     causes: Mapping[Cause, float]
 
     @classmethod
     def of(cls, episodes: Episode) -> "Forecast":
         """Summarise episodes, leaves ``[S, ...]``."""
-        lifetimes, cause, share = (
+        lifetimes, causes, share = (
             np.asarray(leaf) for leaf in (episodes.length, episodes.cause, episodes.first_failure)
         )
         total = share.sum(axis=0)
@@ -46,7 +46,7 @@ class Forecast:
             lifetimes=lifetimes.astype(int),
             first_failure=share.mean(axis=0),
             failure_slot=np.where(total > 0, slot, np.nan),
-            causes={one: float(np.mean(cause == one)) for one in Cause if np.any(cause == one)},
+            causes={cause: float(np.mean(causes == cause)) for cause in Cause if np.any(causes == cause)},
         )
 
     @property
@@ -70,7 +70,7 @@ def make_forecast(
     key: Key[Array, ""] | None = None,
     samples: int = SAMPLES,
 ) -> Forecast:
-    """Forecast how a network fares from a state on if a policy decides.
+    """Forecast the rest of an episode under a policy.
 
     Args:
         policy: decides in every slot.
@@ -82,9 +82,10 @@ def make_forecast(
     """
     state = initial_state(params, layout) if state is None else state
     futures = jax.random.split(jax.random.key(0) if key is None else key, samples)
-    return Forecast.of(_play(policy, params, layout, state, futures))
+    return Forecast.of(_simulate(policy, params, layout, state, futures))
 
 
 @partial(jax.jit, static_argnames="policy")
-def _play(policy: Policy, params: Params, layout: Layout, state: State, futures: Key[Array, " S"]) -> Episode:
+def _simulate(policy: Policy, params: Params, layout: Layout, state: State, futures: Key[Array, " S"]) -> Episode:
+    """Simulate the episode of each future; leaves ``[S, ...]``."""
     return jax.vmap(lambda future: rollout_from(policy, params, layout, state, future))(futures)

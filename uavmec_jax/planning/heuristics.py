@@ -1,15 +1,14 @@
-"""Policies that learn nothing: the baselines every table shows beside the learned ones.
+"""Heuristic policies: the baselines that every table shows beside the learned policies.
 
-Each has the common shape ``policy(params, layout, state, key=None) -> action`` (int32 in ``[0, n)``).
+Each has the signature of a policy, ``policy(params, layout, state, key=None) -> action`` with an int32 in ``[0, n)``.
 """
 
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import Array, Int, PRNGKeyArray
 
 from uavmec_jax.env.dynamics import State, slots_to_expiry
 from uavmec_jax.env.layout import Layout
@@ -21,28 +20,28 @@ from uavmec_jax.planning.shortest_tour import shortest_tour
 
 
 def stay_put(params: Params, layout: Layout, state: State, key: PRNGKeyArray | None = None) -> Array:
-    """Hover over the first device for good."""
+    """Hover above the first device for the whole episode."""
     return jnp.zeros((), jnp.int32)
 
 
 def random(params: Params, layout: Layout, state: State, key: PRNGKeyArray | None = None) -> Array:
-    """Visit any device, uniformly.
+    """Visit a device drawn uniformly.
 
     Raises:
         ValueError: no key was given.
     """
     if key is None:
         raise ValueError("the random policy needs a key")
-    return _numbered(layout, lambda count: jax.random.randint(key, (), 0, count, jnp.int32))
+    return _nth_device(layout, lambda count: jax.random.randint(key, (), 0, count, jnp.int32))
 
 
 def round_robin(params: Params, layout: Layout, state: State, key: PRNGKeyArray | None = None) -> Array:
-    """Visit the devices in the order of their numbers, over and over."""
-    return _numbered(layout, lambda count: state.slot % count)
+    """Visit the devices in the order of their indices, over and over."""
+    return _nth_device(layout, lambda count: state.slot % count)
 
 
-def _numbered(layout: Layout, number: Callable[[Any], Array]) -> Array:
-    """The device with a number that depends on how many there are; entries that are no devices do not count."""
+def _nth_device(layout: Layout, number: Callable[[int | Int[Array, ""]], Int[Array, ""]]) -> Int[Array, ""]:
+    """Return the index of device ``number(count)`` among the ``count`` devices; padding is not counted."""
     if layout.present is None:
         return number(layout.capacity.shape[0])
     chosen = number(jnp.sum(layout.present))
@@ -50,19 +49,19 @@ def _numbered(layout: Layout, number: Callable[[Any], Array]) -> Array:
 
 
 def oldest_first(params: Params, layout: Layout, state: State, key: PRNGKeyArray | None = None) -> Array:
-    """Visit the device whose data are oldest; ties go to the lowest number."""
+    """Visit the device whose data are oldest; ties go to the lowest index."""
     return jnp.argmax(state.age).astype(jnp.int32)
 
 
 def lowest_battery(params: Params, layout: Layout, state: State, key: PRNGKeyArray | None = None) -> Array:
-    """Visit the device with the lowest battery fraction; ties go to the lowest number."""
+    """Visit the device with the lowest battery fraction; ties go to the lowest index."""
     return jnp.argmin(state.battery / layout.capacity).astype(jnp.int32)
 
 
 def shortest_life(params: Params, layout: Layout, state: State, key: PRNGKeyArray | None = None) -> Array:
-    """Visit the device that would fail first if nobody were served from now on, with the consumption to expect.
+    """Visit the device that is expected to fail first if no device is served from now on.
 
-    A battery lasts ``battery / (standby + expected work)`` slots, data last until they expire.
+    A battery lasts for ``battery / (standby + expected work)`` slots, data last until they expire.
     """
     drain = demand.idle_drain(layout, demand.mean_slot(params, layout))
     battery = jnp.where(layout.has_power, jnp.inf, state.battery / jnp.maximum(drain, 1e-6))
@@ -82,4 +81,4 @@ HEURISTICS: Mapping[str, Policy] = MappingProxyType(
         "earliest-deadline": earliest_deadline,
     }
 )
-"""The heuristics by name. None of them knows the volumes of the slot that it decides about."""
+"""Heuristics by name. None of them knows the task volumes of the slot that it decides about."""

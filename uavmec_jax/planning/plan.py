@@ -1,4 +1,4 @@
-"""The plan for one scenario: tours, how far they are from the best possible, a forecast, and what repairs would bring."""
+"""The plan for one scenario: tours, how far they are from the upper bound, a forecast, and what repairs would bring."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -26,22 +26,22 @@ WIDTH = 256
 
 @dataclass(frozen=True)
 class Plan:
-    """What planning says about one scenario; ``D`` volume draws, NumPy arrays.
+    """The result of planning for one scenario with ``D`` volume draws; NumPy arrays.
 
     Attributes:
         params: scenario parameters.
         layout: the devices.
-        lifetimes: ``[D]`` slots by policy: the heuristics, ``rollout``, and ``beam``, which knows the volumes.
+        lifetimes: ``[D]`` slots by policy: the heuristics, ``rollout``, and ``beam``, which is clairvoyant.
         bound: ``[D]`` slots, certified upper bounds on the lifetime of any policy.
-        forecast: under the rollout planner.
-        tours: of ``rollout`` and ``beam`` on the first draw, slot by slot.
-        what_if: every repair and removal of one device, the most useful first.
+        forecast: the forecast under the rollout planner.
+        tours: slot by slot, those of ``rollout`` and ``beam`` on the first draw.
+        what_if: every repair and removal of one device, the largest gain first.
     """
 
     params: Params
     layout: Layout
-    lifetimes: Mapping[str, np.ndarray]
-    bound: np.ndarray
+    lifetimes: Mapping[str, Int[np.ndarray, " D"]]
+    bound: Int[np.ndarray, " D"]
     forecast: Forecast
     tours: Mapping[str, Trace]
     what_if: tuple[WhatIf, ...]
@@ -60,7 +60,7 @@ def make_plan(
         samples: futures that the rollout planner simulates per candidate.
     """
     count = draws.shape[0]
-    # The rollout planner plays the scenario as it is and with every change in one call.
+    # One call of the rollout planner simulates the scenario as it is and with every change.
     changed = every_change(layout)
     layouts = jax.tree.map(lambda *leaves: jnp.repeat(jnp.stack(leaves), count, axis=0), layout, *changed)
     per_layout, per_draw = _repeat(params, len(layouts.capacity)), _repeat(params, count)
@@ -96,10 +96,11 @@ def _repeat(tree: Any, count: int) -> Any:
 
 @jax.jit
 def _trace(params: Params, layout: Layout, draw: Key[Array, ""], tour: Int[Array, " H"]) -> Trace:
+    """Simulate a tour on one volume draw, slot by slot."""
     return trace(tour_policy(tour), params, layout, draw, tour.shape[0])
 
 
-def _started_slots(played: Trace) -> Trace:
-    """The slots that were started; the one that the UAV could not pay for is left out. NumPy leaves."""
-    started = np.asarray(played.played) & ~(np.asarray(played.outcome.cause) == Cause.UAV)
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[started], played)
+def _started_slots(slots: Trace) -> Trace:
+    """Return the slots that were started, without one that the UAV's energy did not pay for; NumPy leaves."""
+    started = np.asarray(slots.played) & ~(np.asarray(slots.outcome.cause) == Cause.UAV)
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[started], slots)
