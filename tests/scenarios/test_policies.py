@@ -1,8 +1,10 @@
-"""Saved policies: what comes back acts as what was trained, and what was tampered with is refused in one line."""
+"""Saved policies: they act as they were trained, and files that were altered are refused in one line."""
 
 import itertools
 import json
+from dataclasses import replace
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,16 +20,16 @@ from uavmec_jax.errors import PolicyError
 from uavmec_jax.planning.heuristics import HEURISTICS
 from uavmec_jax.runs.run import run_study
 from uavmec_jax.scenarios.policies import TrainedPolicy, load_policy
-from uavmec_jax.scenarios.policy_files import PolicyCollection, write_policies
+from uavmec_jax.scenarios.policy_files import PolicyCollection, read_policies, write_policies
 from uavmec_jax.scenarios.seeds import held_out_draws, layout_for_seed
 from uavmec_jax.studies.schema import DQNSettings, PPOSettings
 from uavmec_jax.studies.study import parse_study
 
-ONE = {"algorithm": "dqn", "powered": 12, "connected": 4, "seed": 1}
+AGENT = {"algorithm": "dqn", "powered": 12, "connected": 4, "seed": 1}
 
 
 def collection_of(name, network, settings, agents):
-    """A collection with random weights, best and last."""
+    """Make a collection with random weights, best and last."""
     make = jax.jit(jax.vmap(lambda key: network.init(key, jnp.zeros((1, 24)))))
     kinds = {kind: make(jax.random.split(jax.random.key(i), len(agents))) for i, kind in enumerate(("best", "last"))}
     weights = traverse_util.flatten_dict({name: kinds}, sep="/")
@@ -41,10 +43,10 @@ def collection_of(name, network, settings, agents):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """The folder of a run of eight DQN agents, as far as policies need it."""
+    """The folder of a run of eight DQN agents, with its weights only."""
     directory = tmp_path_factory.mktemp("run")
-    places = itertools.product((0, 1), (12, 4), (12, 4))
-    agents = [dict(zip(("seed", "powered", "connected"), place, strict=True)) for place in places]
+    axes = ("seed", "powered", "connected")
+    agents = [dict(zip(axes, values, strict=True)) for values in itertools.product((0, 1), (12, 4), (12, 4))]
     write_policies(
         directory / "weights.npz",
         collection_of("dqn", dqn.DQNSpec(hidden=(16,)).network, DQNSettings(hidden=(16,)), agents),
@@ -61,14 +63,14 @@ def ppo_policy():
 
 
 @pytest.mark.slow
-def test_an_agent_of_a_run_lives_as_long_as_the_table_says(tmp_path):
+def test_policy_of_a_run_has_the_lifetime_in_its_table(tmp_path):
     results = run_study(parse_study(TINY, "tiny"), tmp_path / "run")
     policy = load_policy(tmp_path / "run", powered=4, connected=12, seed=1)
     assert policy.trained_on == {"seed": 1, "powered": 4, "connected": 12}
     layout = layout_for_seed(1, um.Params(), 4, 12)
-    played = jax.jit(lambda keys: um.rollouts(policy, um.Params(), layout, keys))(held_out_draws(1, 4, 12, 5))
+    episodes = jax.jit(lambda keys: um.rollouts(policy, um.Params(), layout, keys))(held_out_draws(1, 4, 12, 5))
     row = results.agents.query("powered == 4 and connected == 12 and seed == 1")
-    assert_allclose(played.length.mean(), row["best_lifetime"].item(), rtol=1e-6)
+    assert_allclose(episodes.length.mean(), row["best_lifetime"].item(), rtol=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["dqn", "ppo"])
@@ -86,7 +88,7 @@ def test_batched_states_and_numpy_observations(run, ppo_policy, kind):
     assert policy.act(np.asarray(observe(um.Params(), layout, state))).shape == ()
 
 
-def test_a_policy_of_its_own_file(ppo_policy, tmp_path):
+def test_policy_saved_on_its_own(ppo_policy, tmp_path):
     ppo_policy.save(tmp_path / "mine.npz")
     again = load_policy(tmp_path / "mine.npz")
     assert isinstance(again, TrainedPolicy)
@@ -107,33 +109,33 @@ def test_policies_by_name():
 @pytest.mark.parametrize(
     ("axes", "message"),
     [
-        ({}, "8 agents have anything; say which: they differ in connected, powered, seed"),
+        ({}, "there are 8 agents; say which: they differ in connected, powered, seed"),
         ({"powered": 12, "seed": 1}, "2 agents have powered=12, seed=1; say which: they differ in connected"),
         ({"powered": 8}, "none of the 8 agents has powered=8"),
-        ({"colour": 1}, "'colour' tells no agents apart; they have algorithm, connected, powered, seed"),
+        ({"colour": 1}, "'colour' is not an axis of the agents; they have algorithm, connected, powered, seed"),
     ],
 )
-def test_which_agent(run, axes, message):
+def test_ambiguous_or_missing_agent(run, axes, message):
     with pytest.raises(PolicyError) as error:
         load_policy(run, **axes)
     assert str(error.value) == f"{run / 'weights.npz'}: {message}"
 
 
-def test_which_weights(run):
+def test_missing_weights(run):
     with pytest.raises(PolicyError, match="there are no 'worst' weights of 'dqn'; there are best and last of dqn"):
-        um.load_policy(run, "worst", **ONE)
+        um.load_policy(run, "worst", **AGENT)
 
 
 @pytest.mark.parametrize("shape", [(), (23,), (24, 3)])
 def test_observation_of_another_shape(run, shape):
-    policy = load_policy(run, **ONE)
+    policy = load_policy(run, **AGENT)
     with pytest.raises(PolicyError) as error:
         policy.act(np.zeros(shape))
     assert str(error.value) == f"the observation has the shape {shape}; it should be (24,) or (..., 24)"
 
 
-def test_observation_that_is_none_and_another_number_of_devices(run):
-    policy = load_policy(run, **ONE)
+def test_observation_without_numbers_and_another_number_of_devices(run):
+    policy = load_policy(run, **AGENT)
     with pytest.raises(PolicyError, match="is not an array of numbers"):
         policy.act(["a", "b"])
     params = um.Params(n_devices=5)
@@ -142,47 +144,62 @@ def test_observation_that_is_none_and_another_number_of_devices(run):
         policy(params, layout, um.initial_state(params, layout))
 
 
-def rewritten(source, target, change):
-    """A copy of a policy file with its header or arrays changed, as someone with an editor would."""
-    with np.load(source) as arrays:
-        kept = {name: arrays[name] for name in arrays.files}
-    facts = json.loads(str(kept.pop("header")))
-    change(facts, kept)
-    np.savez_compressed(target, header=np.array(json.dumps(facts)), **kept)
+def rewrite(source, target, change):
+    """Copy a policy file with its header or arrays changed, but with the old SHA-256."""
+    with np.load(source) as archive:
+        arrays = dict(archive)
+    facts = json.loads(str(arrays.pop("header")))
+    change(facts, arrays)
+    np.savez_compressed(target, header=np.array(json.dumps(facts)), **arrays)
 
 
 def flip_weight(facts, arrays):
     arrays["dqn/best/params/TorchDense_0/kernel"][0, 0, 0] += 1
 
 
-def newer(facts, arrays):
+def raise_schema(facts, arrays):
     facts["schema"] = 7
 
 
-def other_discount(facts, arrays):
+def change_setting(facts, arrays):
     facts["settings"]["dqn"]["age_scale"] = 0.5
 
 
 ALTERED = [
     (flip_weight, "was altered: its contents do not fit their SHA-256"),
-    (other_discount, "was altered: its contents do not fit their SHA-256"),
-    (newer, "schema is 7; this version reads 1"),
+    (change_setting, "was altered: its contents do not fit their SHA-256"),
+    (raise_schema, "schema is 7; this version reads 1"),
 ]
 
 
 @pytest.mark.parametrize(("change", "message"), ALTERED, ids=[change.__name__ for change, _ in ALTERED])
-def test_altered_file(run, tmp_path, change, message):
+def test_altered_file_is_refused(run, tmp_path, change, message):
     path = tmp_path / "mine.npz"
-    load_policy(run, **ONE).save(path)
-    rewritten(path, tmp_path / "other.npz", change)
+    load_policy(run, **AGENT).save(path)
+    rewrite(path, tmp_path / "other.npz", change)
     with pytest.raises(PolicyError) as error:
         load_policy(tmp_path / "other.npz")
     assert str(error.value) == f"{tmp_path / 'other.npz'}: {message}"
 
 
-def test_truncated_flipped_and_foreign_files(run, tmp_path):
+def test_weights_that_are_not_finite_are_refused(run, tmp_path):
+    collection = read_policies(run / "weights.npz")
+    key = "dqn/best/params/TorchDense_0/kernel"
+    weights = dict(collection.weights) | {key: collection.weights[key].copy()}
+    weights[key][5, 0, 0] = np.nan  # seed 1, powered 12, connected 4
+    write_policies(tmp_path / "weights.npz", replace(collection, weights=weights))
+    with pytest.raises(PolicyError) as error:
+        load_policy(tmp_path, **AGENT)
+    assert str(error.value) == (
+        f"{tmp_path / 'weights.npz'}: the best weights of dqn are not finite: training diverged"
+    )
+    assert load_policy(tmp_path, "last", **AGENT).n_devices == 12
+    assert load_policy(tmp_path, **AGENT | {"seed": 0}).n_devices == 12
+
+
+def test_damaged_and_foreign_files_are_refused(run, tmp_path):
     path = tmp_path / "mine.npz"
-    load_policy(run, **ONE).save(path)
+    load_policy(run, **AGENT).save(path)
     whole = path.read_bytes()
     for broken in (whole[:-40], whole[: len(whole) // 2], b"", b"not a zip"):
         path.write_bytes(broken)
@@ -190,7 +207,7 @@ def test_truncated_flipped_and_foreign_files(run, tmp_path):
             load_policy(path)
         assert "\n" not in str(error.value)
     rng = np.random.default_rng(0)
-    for place in rng.integers(0, len(whole), 30):  # one flipped bit anywhere: refused, or nothing that matters
+    for place in rng.integers(0, len(whole), 30):  # a flipped bit is noticed, or changes no weight
         flipped = bytearray(whole)
         flipped[place] ^= 1 << int(rng.integers(8))
         path.write_bytes(flipped)
@@ -199,7 +216,7 @@ def test_truncated_flipped_and_foreign_files(run, tmp_path):
         except PolicyError:
             continue
         path.write_bytes(whole)
-        jax.tree.map(assert_array_equal, policy.collection.weights, load_policy(path).collection.weights)
+        chex.assert_trees_all_equal(policy.collection.weights, load_policy(path).collection.weights)
     np.savez(path, x=np.zeros(3))
     with pytest.raises(PolicyError, match="is not a file of policies"):
         load_policy(path)

@@ -1,22 +1,21 @@
-"""Layout files: what users write about their own devices."""
+"""Scenario files: what users write about their devices is read, written back, and refused where it is wrong."""
 
 from pathlib import Path
 
-import jax
+import chex
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 
 from uavmec_jax.env.hardware import ACTIVE_POWER_W, PROCESSING_RATE_BYTES_S, STANDBY_POWER_W
 from uavmec_jax.env.params import Params
 from uavmec_jax.errors import ScenarioError
-from uavmec_jax.scenarios.named_scenario import name_scenario
+from uavmec_jax.scenarios.named_scenario import UNLISTED, name_scenario
 from uavmec_jax.scenarios.scenario_files import load_scenario_file, scenario_text
 from uavmec_jax.scenarios.seeds import layout_for_seed
-from uavmec_jax.search.confirm import OWN
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
-ONE = """
+DEVICE = """
 [[device]]
 name = "a"
 x_m = 1.0
@@ -27,17 +26,17 @@ capacity_j = 5e4
 """
 
 
-def written(tmp_path, text, name="layout_for_seed.toml"):
+def write(tmp_path, text, name="scenario.toml"):
     path = tmp_path / name
     path.write_text(text)
     return path
 
 
-def test_degrees_become_metres_and_own_hardware_is_taken():
+def test_degrees_become_metres_and_given_hardware_is_used():
     harbour = load_scenario_file(EXAMPLES / "harbour.toml")
-    assert harbour.names[2] == "tide gauge"
+    assert harbour.device_names[2] == "tide gauge"
     layout = harbour.layout
-    assert layout.device_type.tolist() == [3, 0, OWN, 2, 4, 2]
+    assert layout.device_type.tolist() == [3, 0, UNLISTED, 2, 4, 2]
     assert_allclose([layout.standby_power[2], layout.active_power[2], layout.processing_rate[2]], [1.2, 0.8, 9000.0])
     assert_allclose(layout.standby_power[0], STANDBY_POWER_W[3])
     assert_allclose(layout.active_power[0], ACTIVE_POWER_W[4, 3])
@@ -52,75 +51,84 @@ def test_degrees_become_metres_and_own_hardware_is_taken():
     assert_allclose(harbour.geographic(np.asarray(layout.position))[4], [9.9880, 53.5455], atol=1e-6)
 
 
-def test_toml_reads_back_to_the_same(tmp_path):
+def test_toml_round_trip(tmp_path):
     harbour = load_scenario_file(EXAMPLES / "harbour.toml")
-    again = load_scenario_file(written(tmp_path, scenario_text(harbour)))
+    again = load_scenario_file(write(tmp_path, scenario_text(harbour)))
     assert again.file == harbour.file
-    jax.tree.map(assert_array_equal, again.layout, harbour.layout)
+    chex.assert_trees_all_equal(again.layout, harbour.layout)
 
 
-def test_csv_reads_back_to_the_same(tmp_path):
+def test_csv_round_trip(tmp_path):
     village = load_scenario_file(EXAMPLES / "village.csv")
     assert village.layout.has_power.tolist() == [False, False, True, False]
-    again = load_scenario_file(written(tmp_path, scenario_text(village, ".csv"), "village.csv"))
+    again = load_scenario_file(write(tmp_path, scenario_text(village, ".csv"), "village.csv"))
     assert again.file == village.file
-    as_toml = load_scenario_file(written(tmp_path, scenario_text(village), "village.toml"))
-    jax.tree.map(assert_array_equal, as_toml.layout, village.layout)
+    as_toml = load_scenario_file(write(tmp_path, scenario_text(village), "village.toml"))
+    chex.assert_trees_all_equal(as_toml.layout, village.layout)
     with pytest.raises(ScenarioError, match="a CSV has no place for params"):
         scenario_text(load_scenario_file(EXAMPLES / "harbour.toml"), ".csv")
 
 
-def test_a_random_town_reads_back_to_the_same(tmp_path):
+def test_random_scenario_round_trip(tmp_path):
     params = Params(region_m=(500.0, 300.0))
     layout = layout_for_seed(4, params, 5, 7)
-    again = load_scenario_file(written(tmp_path, scenario_text(name_scenario(layout, params, "layout_for_seed"))))
-    jax.tree.map(assert_array_equal, again.layout, layout)
+    again = load_scenario_file(write(tmp_path, scenario_text(name_scenario(layout, params, "random"))))
+    chex.assert_trees_all_equal(again.layout, layout)
     assert again.params == params
 
 
-def test_a_place_on_the_map_is_needed_for_degrees():
+def test_degrees_need_an_origin():
     with pytest.raises(ScenarioError, match="has no place on the map; give origin"):
         load_scenario_file(EXAMPLES / "village.csv").geographic(np.zeros(2))
 
 
 BAD = {
     "no device": ('name = "x"', "holds 0 devices; give 1 to 64"),
-    "outside": (ONE.replace("x_m = 1.0", "x_m = 900.0"), "device 1 (a): lies at 900, 1 m, outside the region of 800 x"),
-    "twice": (ONE + ONE, "device 2: name is 'a', which another device has"),
-    "type": (ONE.replace("Firefly", "Fireflyy"), "type is 'Fireflyy', which the tables do not know; did you mean 'Fir"),
-    "no type": (ONE.replace('type = "Firefly"', ""), "type is missing; or give standby_power_w, active_power_w"),
-    "half own": (ONE.replace("Firefly", "x") + "active_power_w = 1.0", "type is 'x', which the tables do not know"),
-    "capacity": (ONE.replace("5e4", "0"), "device 1 (a): capacity_j is 0; it should be greater than 0"),
-    "no capacity": (ONE.replace("capacity_j = 5e4", ""), "device 1 (a): capacity_j is missing"),
+    "outside": (
+        DEVICE.replace("x_m = 1.0", "x_m = 900.0"),
+        "device 1 (a): lies at 900, 1 m, outside the region of 800 x",
+    ),
+    "twice": (DEVICE + DEVICE, "device 2: name is 'a', which another device has"),
+    "type": (
+        DEVICE.replace("Firefly", "Fireflyy"),
+        "type is 'Fireflyy', which the tables do not list; did you mean 'Fir",
+    ),
+    "no type": (DEVICE.replace('type = "Firefly"', ""), "type is missing; or give standby_power_w, active_power_w"),
+    "half given": (
+        DEVICE.replace("Firefly", "x") + "active_power_w = 1.0",
+        "type is 'x', which the tables do not list",
+    ),
+    "capacity": (DEVICE.replace("5e4", "0"), "device 1 (a): capacity_j is 0; it should be greater than 0"),
+    "no capacity": (DEVICE.replace("capacity_j = 5e4", ""), "device 1 (a): capacity_j is missing"),
     "hop": (
-        "[params]\nuav_battery_j = 10.0\n" + ONE,
+        "[params]\nuav_battery_j = 10.0\n" + DEVICE,
         "the hop from the start to a, 1 m, takes 0 kJ; the UAV's battery",
     ),
-    "field": (ONE + "colour = 3", "device 1 (a): colour is not a field"),
+    "field": (DEVICE + "colour = 3", "device 1 (a): colour is not a setting"),
     "param": (
-        "[params]\nuav_batery_j = 3.0\n" + ONE,
-        "params.uav_batery_j is not a field; did you mean 'uav_battery_j'?",
+        "[params]\nuav_batery_j = 3.0\n" + DEVICE,
+        "params.uav_batery_j is not a setting; did you mean 'uav_battery_j'?",
     ),
-    "place": (ONE.replace("x_m = 1.0", ""), "device 1 (a): position is unclear; give x_m and y_m, or lon and lat"),
-    "both": (ONE + "lon = 3.0\nlat = 4.0", "device 1 (a): position is unclear"),
-    "nan": (ONE.replace("x_m = 1.0", "x_m = nan"), "x_m is nan; it should be a finite number"),
-    "count": ("[params]\nn_devices = 3\n" + ONE, "params.n_devices is 3, but there are 1 devices; leave it out"),
+    "place": (DEVICE.replace("x_m = 1.0", ""), "device 1 (a): position is unclear; give x_m and y_m, or lon and lat"),
+    "both": (DEVICE + "lon = 3.0\nlat = 4.0", "device 1 (a): position is unclear"),
+    "nan": (DEVICE.replace("x_m = 1.0", "x_m = nan"), "x_m is nan; it should be a finite number"),
+    "count": ("[params]\nn_devices = 3\n" + DEVICE, "params.n_devices is 3, but there are 1 devices; leave it out"),
     "range": (
-        "[params]\ntask_volume_range_bytes = [4e6, 2e6]\n" + ONE,
+        "[params]\ntask_volume_range_bytes = [4e6, 2e6]\n" + DEVICE,
         "params.task_volume_range_bytes is [4000000.0, 2",
     ),
-    "origin": ("origin = [9.9, 95.0]\n" + ONE, "origin.1 is 95.0; it should be less than or equal to 89"),
+    "origin": ("origin = [9.9, 95.0]\n" + DEVICE, "origin.1 is 95.0; it should be less than or equal to 89"),
     "toml": ("[[device]", "not TOML"),
     "table": ("device = [3]", "device 1 (3): "),
 }
 
 
 @pytest.mark.parametrize(("text", "message"), BAD.values(), ids=BAD)
-def test_bad_inventory_is_one_clear_line(tmp_path, text, message):
+def test_bad_scenario_is_refused_in_one_line(tmp_path, text, message):
     with pytest.raises(ScenarioError) as error:
-        load_scenario_file(written(tmp_path, text))
+        load_scenario_file(write(tmp_path, text))
     assert message in str(error.value)
-    assert str(error.value).startswith(str(tmp_path / "layout_for_seed.toml"))
+    assert str(error.value).startswith(str(tmp_path / "scenario.toml"))
     assert "\n" not in str(error.value)
 
 
@@ -136,13 +144,14 @@ def test_bad_inventory_is_one_clear_line(tmp_path, text, message):
         ("", "holds 0 devices"),
     ],
 )
-def test_bad_csv_is_one_clear_line(tmp_path, text, message):
+def test_bad_csv_is_refused_in_one_line(tmp_path, text, message):
     with pytest.raises(ScenarioError) as error:
-        load_scenario_file(written(tmp_path, text, "layout_for_seed.csv"))
+        load_scenario_file(write(tmp_path, text, "scenario.csv"))
     assert message in str(error.value)
+    assert "\n" not in str(error.value)
 
 
-def test_files_that_are_none(tmp_path):
+def test_missing_file_and_unknown_format(tmp_path):
     with pytest.raises(ScenarioError, match=r"cannot be read: No such file"):
         load_scenario_file(tmp_path / "none.toml")
     with pytest.raises(ScenarioError, match=r"ends in .toml or .csv"):

@@ -1,7 +1,9 @@
-"""State files: where a network stands, and one clear line for whatever does not fit its layout."""
+"""State files: the present state is read and written back, and refused in one line where it does not fit."""
 
 import json
+from dataclasses import replace
 
+import chex
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -13,7 +15,7 @@ from uavmec_jax.scenarios.scenario_files import load_scenario_file
 from uavmec_jax.scenarios.state_files import load_state, make_state, state_data
 
 HARBOUR = load_scenario_file(EXAMPLES / "harbour.toml")
-NAMES = HARBOUR.names
+NAMES = HARBOUR.device_names
 CAPACITY = np.asarray(HARBOUR.layout.capacity, float).tolist()
 
 
@@ -21,17 +23,17 @@ def state_of(data):
     return make_state({k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}, HARBOUR, "now.json")
 
 
-def test_nothing_given_is_the_beginning():
-    fresh = initial_state(HARBOUR.params, HARBOUR.layout)
-    for name, value in vars(state_of({})).items():
-        assert_array_equal(value, getattr(fresh, name))
+def test_empty_file_is_the_initial_state():
+    chex.assert_trees_all_equal(state_of({}), initial_state(HARBOUR.params, HARBOUR.layout))
 
 
-def test_lists_and_names():
+def test_values_by_position_and_by_name():
     ages = [1, 2, 3, 4, 5, 6]
     listed = state_of({"battery_j": [c / 2 for c in CAPACITY], "age_slots": ages, "uav_energy_j": 900_000, "slot": 7})
     assert_allclose(listed.battery, np.array(CAPACITY) / 2, rtol=1e-6)
-    assert_array_equal(listed.age, np.where(HARBOUR.layout.has_comms, 0, ages))  # connected devices send by themselves
+    assert_array_equal(
+        listed.age, np.where(HARBOUR.layout.has_comms, 0, ages)
+    )  # connected devices deliver by themselves
     assert (float(listed.uav_energy), int(listed.slot)) == (900_000, 7)
     named = state_of({"battery_j": {NAMES[2]: 1234.0}, "uav_at": NAMES[1]})
     assert_allclose(named.battery, [*CAPACITY[:2], 1234.0, *CAPACITY[3:]], rtol=1e-6)
@@ -40,10 +42,8 @@ def test_lists_and_names():
 
 def test_round_trip(tmp_path):
     state = state_of({"battery_j": [c / 3 for c in CAPACITY], "uav_position_m": [12.5, 40.0], "slot": 3})
-    (tmp_path / "now.json").write_text(json.dumps(state_data(state, HARBOUR)))
-    again = load_state(tmp_path / "now.json", HARBOUR)
-    for name, value in vars(again).items():
-        assert_allclose(value, getattr(state, name), rtol=1e-5, atol=1e-2)
+    (tmp_path / "now.json").write_text(json.dumps(state_data(replace(HARBOUR, state=state))))
+    chex.assert_trees_all_close(load_state(tmp_path / "now.json", HARBOUR), state, rtol=1e-5, atol=1e-2)
 
 
 NAN = float("nan")
@@ -71,16 +71,16 @@ NAN = float("nan")
         ({"batery_j": []}, "batery_j is not a setting; did you mean 'battery_j'?"),
     ],
 )
-def test_what_does_not_fit_is_one_line(data, words):
-    with pytest.raises(StateError) as told:
+def test_bad_state_is_refused_in_one_line(data, words):
+    with pytest.raises(StateError) as error:
         state_of(data)
-    message = str(told.value)
+    message = str(error.value)
     assert words in message
     assert message.startswith("now.json: ")
     assert "\n" not in message
 
 
-def test_files_that_are_none(tmp_path):
+def test_missing_file_and_no_json_object(tmp_path):
     path = tmp_path / "now.json"
     with pytest.raises(StateError, match=r"now\.json"):
         load_state(path, HARBOUR)

@@ -9,7 +9,8 @@ from uavmec_jax.errors import StudyError
 from uavmec_jax.runs.results_folder import load_results
 from uavmec_jax.runs.run import run_study
 from uavmec_jax.runs.run_plan import plan_run
-from uavmec_jax.studies.evaluation import DistinctScenarios, EvaluationResult
+from uavmec_jax.studies.evaluation import DistinctScenarios
+from uavmec_jax.studies.evaluation_result import EvaluationResult, PlannerResult
 from uavmec_jax.studies.results_files import load_weights
 from uavmec_jax.studies.study import parse_study
 from uavmec_jax.training.population import Progress
@@ -46,23 +47,23 @@ def test_one_study_trains_each_algorithm_as_one_program(tmp_path):
     study = parse_study(TOML, "three")
     plan = plan_run(study)
     assert plan.agents == 3 * 2 * 2 * 3  # the reward U has one guard
-    assert list(plan.blocks) == ["dqn", "ppo", "a2c"]
-    news: list[Progress] = []
-    results = run_study(study, tmp_path / "run", on_progress=news.append)
+    assert list(plan.partitions) == ["dqn", "ppo", "a2c"]
+    reports: list[Progress] = []
+    results = run_study(study, tmp_path / "run", on_progress=reports.append)
     assert results.run["complete"]
-    assert [one.steps for one in news] == sorted(one.steps for one in news)
-    assert news[-1].steps == news[-1].total_steps == plan.total_steps == results.run["environment_steps"]
-    assert {one.block for one in news} == {0, 1, 2}
+    assert [report.steps for report in reports] == sorted(report.steps for report in reports)
+    assert reports[-1].steps == reports[-1].total_steps == plan.total_steps == results.run["environment_steps"]
+    assert {report.shard for report in reports} == {0, 1, 2}
     assert results.agents["algorithm"].tolist() == ["dqn"] * 12 + ["ppo"] * 12 + ["a2c"] * 12
     assert results.agents.groupby("algorithm")["steps"].first().to_dict() == {"dqn": 640, "ppo": 640, "a2c": 640}
-    # what nobody learned is the same for all agents of a scenario
+    # heuristics and planners have the same results for all agents of a scenario
     for column in ("oldest_first_lifetime", "rollout_planned", "bound_planned"):
         assert (results.agents.groupby(["seed", "powered", "connected"])[column].nunique() == 1).all()
     assert (results.agents["bound_planned"] >= results.agents["best_planned"]).all()
 
     again = load_results(tmp_path / "run")
     assert list(again.curves) == ["dqn", "ppo", "a2c"]
-    assert again.curves["ppo"]["validation"].shape == (12, 3)  # looks after 2, 4 and 5 rollouts of 128 steps
+    assert again.curves["ppo"]["validation"].shape == (12, 3)  # validated after 2, 4 and 5 rollouts of 128 steps
     assert "critic" in load_weights(tmp_path / "run", algorithm="a2c")["params"]
     pd.testing.assert_frame_equal(again.cells(), results.cells(), rtol=1e-4)
 
@@ -70,8 +71,8 @@ def test_one_study_trains_each_algorithm_as_one_program(tmp_path):
     for other in ("dqn", "a2c"):
         text = text.replace(f"[{other}]\nhidden = [16]\n", "")
     alone = run_study(parse_study(text, "alone"))
-    mine = results.agents.query("algorithm == 'ppo'").reset_index(drop=True)
-    pd.testing.assert_frame_equal(alone.agents, mine)
+    together = results.agents.query("algorithm == 'ppo'").reset_index(drop=True)
+    pd.testing.assert_frame_equal(alone.agents, together)
 
 
 @pytest.mark.slow
@@ -89,8 +90,8 @@ def test_a_function_is_a_reward_for_a_whole_study():
     assert results.run["reward_function"].endswith("product")
     linear = run_study(study)
     assert "reward_function" not in linear.run
-    mine, theirs = (r.weights["dqn/last/params/TorchDense_0/kernel"] for r in (results, linear))
-    assert (mine != theirs).any()
+    key = "dqn/last/params/TorchDense_0/kernel"
+    assert (results.weights[key] != linear.weights[key]).any()
 
 
 def test_a_function_beside_an_axis_of_rewards_is_refused():
@@ -100,11 +101,14 @@ def test_a_function_beside_an_axis_of_rewards_is_refused():
 
 
 def test_distinct_scenarios():
-    played = pd.DataFrame({"seed": [1, 1, 0, 1], "powered": [8, 6, 8, 8]})
-    distinct = DistinctScenarios.of(played)
+    distinct = DistinctScenarios.of(pd.DataFrame({"seed": [1, 1, 0, 1], "powered": [8, 6, 8, 8]}))
     assert_array_equal(distinct.first, [0, 1, 2])
     assert_array_equal(distinct.scenario, [0, 1, 2, 0])
     assert_array_equal(distinct.longest(np.array([[3, 1], [5, 5], [2, 2], [1, 4]])), [[3, 4], [5, 5], [2, 2]])
-    judged = EvaluationResult(np.array([[7, 8], [9, 9], [1, 2]]), np.zeros((3, 2), np.int8), np.zeros((3, 2, 4)))
-    assert_array_equal(distinct.to_agents(judged).lifetime, [[7, 8], [9, 9], [1, 2], [7, 8]])
-    assert distinct.to_agents(judged).first_failure.shape == (4, 2, 4)
+    lifetime = np.array([[7, 8], [9, 9], [1, 2]])
+    result = distinct.to_agents(EvaluationResult(lifetime, np.zeros((3, 2), np.int8), np.zeros((3, 2, 4))))
+    assert_array_equal(result.lifetime, [[7, 8], [9, 9], [1, 2], [7, 8]])
+    assert result.first_failure.shape == (4, 2, 4)
+    bound = distinct.to_agents(PlannerResult(lifetime))
+    assert_array_equal(bound.lifetime, result.lifetime)
+    assert bound.cause is None

@@ -1,15 +1,18 @@
-"""Studies of drawn scenarios: what a file may say, how agents are judged, and that a policy of one plays anywhere."""
+"""Studies of drawn scenarios: their files, their evaluation, and their policies for any number of devices."""
 
+from functools import partial
+
+import chex
 import jax
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from tests.experiments.scripts import run as run_script
-from tests.populations import take
-from uavmec_jax.agents import collect_rollout as experience
-from uavmec_jax.agents import on_policy, ppo
+from tests.populations import stack, take
+from uavmec_jax.agents import ppo
 from uavmec_jax.agents.algorithm import AGENTS_AXIS
+from uavmec_jax.agents.collect_rollout import collect_rollout
 from uavmec_jax.env.dynamics import initial_state
 from uavmec_jax.env.layout import sample_layout
 from uavmec_jax.env.params import Params
@@ -53,17 +56,17 @@ def study_of(text=TOML, **overrides):
     return parse_study(text, "mine.toml", overrides)
 
 
-def test_all_agents_are_judged_in_the_same_scenarios():
+def test_all_agents_are_evaluated_on_the_same_scenarios():
     study = study_of()
     assert make_agent_ids(study) == [{"seed": 0, "scenarios": "drawn"}, {"seed": 1, "scenarios": "drawn"}]
     for keys in (validation_keys(study), evaluation_keys(study)):
         first, second = jax.random.key_data(keys)
         assert_array_equal(first, second)
-    one, other = jax.random.key_data(make_agents(study).key)
-    assert (one != other).any()
+    first, second = jax.random.key_data(make_agents(study).key)
+    assert (first != second).any()
 
 
-def test_a_study_reads_back_to_itself():
+def test_study_round_trip():
     study = study_of()
     assert parse_study(study_toml(study), "again.toml") == study
     assert load_study("generalist").scenarios.places == ("albany", "round_lake")
@@ -97,43 +100,38 @@ def test_a_study_reads_back_to_itself():
             "scenarios.typical_devices is 7; params.n_devices, 6, is the most",
         ),
         ("seeds = 2", "seeds = 2\npowered = [4]", "axes.powered is given, and scenarios too"),
-        ('algorithm = "ppo"', 'algorithm = "dqn"', "algorithm is 'dqn', which plays one scenario"),
+        ('algorithm = "ppo"', 'algorithm = "dqn"', "algorithm is 'dqn', which trains on one scenario"),
         ("steps = 64", 'steps = 64\nplace = "albany"', "place is given, and scenarios too"),
         ('observation = "full"', 'observation = "all"', "ppo.observation is 'all'"),
     ],
 )
-def test_what_does_not_fit_is_one_line(old, new, words):
+def test_bad_setting_is_refused_in_one_line(old, new, words):
     text = TOML.replace(old, new)
     if "dqn" in new:
         text = text[: text.index("[ppo]")] + text[text.index("[evaluation]") :]
-    with pytest.raises(StudyError) as told:
+    with pytest.raises(StudyError) as error:
         study_of(text)
-    assert words in str(told.value)
-    assert "\n" not in str(told.value)
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.slow
 def test_an_episode_that_ends_is_followed_by_one_in_a_fresh_scenario():
-    """Where an episode ended the town is another one, the others go on in theirs."""
+    """Where an episode has ended, the layout is another one; elsewhere it stays."""
     study = study_of()
     agent = take(make_agents(study), 0)
     spec = ppo.PPOSpec(hidden=(8,), observation="full", n_envs=16, n_steps=1, n_devices=6, batch_size=16)
-    state = on_policy.init(spec, ppo._OPTIMIZER, agent)
-    play = jax.jit(jax.vmap(lambda state, key: experience.play(spec, agent, state, key), axis_name=AGENTS_AXIS))
+    state = ppo.algorithm(spec).init(agent)
+    collect = jax.jit(jax.vmap(partial(collect_rollout, spec, agent), axis_name=AGENTS_AXIS))
     some_ended = False
     for number in range(16):
-        key = jax.random.key(number)[None]
-        after, samples = play(jax.tree.map(lambda leaf: leaf[None], state), key)
-        after = take(after, 0)
-        begun = np.asarray(after.worlds.slot) == 0
-        moved = (np.asarray(after.scenarios.layout.position) != np.asarray(state.scenarios.layout.position)).any((1, 2))
-        assert_array_equal(begun, moved)
-        assert np.isfinite(np.asarray(samples.observation)).all()
-        present = np.take_along_axis(
-            np.asarray(state.scenarios.layout.present), np.asarray(samples.action)[0][:, None], 1
-        )
-        assert present.all()
-        some_ended |= begun.any()
+        after, samples = take(collect(stack([state]), jax.random.key(number)[None]), 0)
+        ended = np.asarray(after.env_states.slot) == 0
+        before_layout, after_layout = state.scenarios.layout, after.scenarios.layout
+        assert_array_equal(ended, np.any(before_layout.position != after_layout.position, axis=(1, 2)))
+        chex.assert_tree_all_finite(samples)
+        assert np.take_along_axis(np.asarray(before_layout.present), np.asarray(samples.action)[:, None], 1).all()
+        some_ended |= ended.any()
         state = after
     assert some_ended
 
@@ -145,7 +143,7 @@ def run(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_run_is_judged_and_read_back(run):
+def test_results_of_a_run(run):
     results, _ = run
     assert results.run["complete"]
     assert results.agents["scenarios"].tolist() == ["drawn", "drawn"]
@@ -157,7 +155,7 @@ def test_a_run_is_judged_and_read_back(run):
 
 
 @pytest.mark.slow
-def test_its_policies_play_any_number_of_devices(run):
+def test_its_policies_take_any_number_of_devices(run):
     _, folder = run
     with pytest.raises(PolicyError, match="they differ in seed"):
         load_policy(folder)
@@ -168,23 +166,23 @@ def test_its_policies_play_any_number_of_devices(run):
         assert 0 <= int(policy(params, layout, initial_state(params, layout))) < n
 
 
-def test_what_is_unlike_the_training_is_named():
+def test_quantities_outside_the_training_distribution_are_named():
     study = load_study("generalist")
     scenarios, trained = study.scenarios.model_dump(), study.params.model_dump()
     params = Params()
     layout = sample_layout(jax.random.key(0), params, 8, 8)
     assert out_of_distribution(scenarios, trained, params, layout) == []
     far = Params(n_devices=40, data_age_limit_slots=20, uav_speed_m_s=9.0, region_m=(9000.0, 9000.0))
-    found = out_of_distribution(scenarios, trained, far, sample_layout(jax.random.key(0), far, 8, 8))
-    named = [line.split(":")[0] for line in found]
-    assert named == ["devices", "extent in m", "the UAV's speed in m/s", "data_age_limit_slots"]
-    assert found[0] == "devices: 40; it was trained on 4 to 16"
-    assert found[-1] == "data_age_limit_slots: 20; it was trained on 10"
+    lines = out_of_distribution(scenarios, trained, far, sample_layout(jax.random.key(0), far, 8, 8))
+    quantities = [line.split(":")[0] for line in lines]
+    assert quantities == ["devices", "extent in m", "the UAV's speed in m/s", "data_age_limit_slots"]
+    assert lines[0] == "devices: 40; it was trained on 4 to 16"
+    assert lines[-1] == "data_age_limit_slots: 20; it was trained on 10"
 
 
 @pytest.mark.slow
-def test_the_paper_s_observation_learns_on_drawn_scenarios_too():
-    """Nothing ties drawn scenarios to the full observation: a network of the paper's words takes layouts of one size."""
+def test_training_on_drawn_scenarios_with_the_papers_observation():
+    """Drawn scenarios do not need the full observation: a network on the paper's takes padded layouts of one size."""
     study = study_of(TOML.replace('observation = "full"', 'observation = "paper"'), **{"axes.seeds": 1})
     results = run_study(study)
     assert_allclose(results.agents["diverged_at"], -1)
@@ -192,7 +190,7 @@ def test_the_paper_s_observation_learns_on_drawn_scenarios_too():
 
 @pytest.mark.slow
 def test_its_best_policy_is_shipped(run, tmp_path):
-    """The script that ships the generalist does not train a run again that is there: here a tiny one."""
+    """The script that ships the generalist takes a finished run as it is, here a tiny one."""
     results, folder = run
     out = run_script("ship_generalist.py", "--run", folder, "--into", tmp_path / "mine.npz")
     assert "mine.npz" in out

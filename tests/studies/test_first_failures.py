@@ -1,4 +1,4 @@
-"""AgentIds fails first, and the test of the paper's claim, on invented failures."""
+"""First failures and the test of the paper's claim, on made-up results."""
 
 import io
 
@@ -28,8 +28,10 @@ from uavmec_jax.studies.study import load_study
 
 @pytest.fixture(scope="module")
 def results():
-    """Ten seeds: everywhere device 2 (high traffic in both places) fails first, but with a penalty device 9, at a slot's
-    price; seed 0 is stubborn. The bonus changes nothing."""
+    """Results of ten seeds in which device 2 (high traffic in both places) fails first.
+
+    With a penalty it is device 9, for one slot of lifetime, except for seed 0. The bonus has no effect.
+    """
     study = load_study("table7", {"axes.seeds": 10})
     agents = pd.DataFrame(make_agent_ids(study))
     spared = (agents.traffic_penalty > 0) & (agents.seed > 0)
@@ -55,9 +57,9 @@ def test_counts_add_up_to_the_scenarios(results):
     sums = counts.groupby(["place", "traffic_penalty", "traffic_bonus", "policy"])["count"].sum()
     assert len(sums) == 2 * 4 * 4
     assert_allclose(sums, 10)
-    own = counts.query("place == 'albany' and policy == 'best' and traffic_penalty == 300 and traffic_bonus == 0")
-    assert own.set_index("device")["count"].loc[[2, 9]].tolist() == [1, 9]
-    assert own.set_index("device")["high_traffic"].loc[[2, 9]].tolist() == [True, False]
+    cell = counts.query("place == 'albany' and policy == 'best' and traffic_penalty == 300 and traffic_bonus == 0")
+    assert cell.set_index("device")["count"].loc[[2, 9]].tolist() == [1, 9]
+    assert cell.set_index("device")["high_traffic"].loc[[2, 9]].tolist() == [True, False]
 
 
 def test_share_on_devices_in_high_traffic(results):
@@ -68,31 +70,31 @@ def test_share_on_devices_in_high_traffic(results):
 def test_the_claim_is_tested_seed_by_seed(results):
     claims = traffic_claims(results).set_index(["policy", "place", "traffic_penalty", "traffic_bonus"])
     assert len(claims) == 2 * 3 * 3
-    fined = claims.loc[("best", "all places", 300.0, 0.0)]
-    assert (fined["fewer"], fined["more"], fined["same"]) == (9, 0, 1)
-    assert_allclose(fined["p_value"], 2 / 2**9)
-    assert_allclose([fined["share_without"], fined["share"], fined["difference"]], [1, 0.1, -0.9])
-    assert fined["low"] <= -0.9 <= fined["high"]
-    assert_allclose([fined["g"], fined["slots"]], [0.5, -0.9])
-    paid = claims.loc[("best", "albany", 0.0, 10.0)]
-    assert (paid["same"], paid["p_value"], paid["g"], paid["difference"]) == (10, 1, 0, 0)
+    penalty = claims.loc[("best", "all places", 300.0, 0.0)]
+    assert (penalty["fewer"], penalty["more"], penalty["same"]) == (9, 0, 1)
+    assert_allclose(penalty["p_value"], 2 / 2**9)
+    assert_allclose([penalty["share_without"], penalty["share"], penalty["difference"]], [1, 0.1, -0.9])
+    assert penalty["low"] <= -0.9 <= penalty["high"]
+    assert_allclose([penalty["g"], penalty["slots"]], [0.5, -0.9])
+    bonus = claims.loc[("best", "albany", 0.0, 10.0)]
+    assert (bonus["same"], bonus["p_value"], bonus["g"], bonus["difference"]) == (10, 1, 0, 0)
 
 
-def test_without_agents_to_hold_it_against_there_is_no_claim(results):
-    alone = Results(
+def test_no_claim_without_agents_to_compare_with(results):
+    only_penalty = Results(
         study=load_study("table7", {"axes.seeds": 10, "axes.traffic_penalty": [300.0], "axes.traffic_bonus": [0.0]}),
         run=results.run,
         agents=results.agents.query("traffic_penalty > 0 and traffic_bonus == 0").reset_index(drop=True),
         evaluation={name: leaf[:20] for name, leaf in results.evaluation.items()},
     )
-    assert traffic_claims(alone).empty
+    assert traffic_claims(only_penalty).empty
 
 
 def test_tables_like_the_papers(results):
     console = Console(width=160, record=True, file=io.StringIO())
-    shown = tables(results)
-    assert len(shown) == 4
-    for table in shown.values():
+    by_title = tables(results)
+    assert len(by_title) == 4
+    for table in by_title.values():
         console.print(table)
     text = console.export_text()
     for words in ("failure 300", "visit 10 + failure 300", "oldest", "paper", "9/0/1", "0.0039", "+0.50"):
@@ -103,7 +105,7 @@ def test_tables_like_the_papers(results):
     ]  # fmt: skip
 
 
-def test_cells_of_a_place_have_tables_of_their_own(results):
+def test_every_cell_of_a_place_has_its_table(results):
     both = pd.concat([results.agents, results.agents.assign(powered=6)], ignore_index=True)
     study = load_study("table7", {"axes.seeds": 10, "axes.cells": [[8, 6], [6, 6]]})
     evaluation = {name: np.concatenate([leaf, leaf]) for name, leaf in results.evaluation.items()}
@@ -113,33 +115,32 @@ def test_cells_of_a_place_have_tables_of_their_own(results):
     ]  # fmt: skip
     assert len(tables(twice)) == 1 + 4 + 1
     assert figures.run_figure(twice)
-    told = place_frames(twice)
-    assert len(told["claims"]) == 2 * len(traffic_claims(results))
+    assert len(place_frames(twice)["claims"]) == 2 * len(traffic_claims(results))
     assert place_frames(Results(study=study, run={})) == {}
 
 
 def test_a_study_of_places_that_trains_nothing(results):
     study = load_study("table7", {"axes.seeds": 10, "algorithm": "none", "axes.traffic_penalty": [0.0]})
-    idle = results.agents.drop(columns=[name for name in results.agents if name.startswith(("best", "last"))])
+    agents = results.agents.drop(columns=[name for name in results.agents if name.startswith(("best", "last"))])
     evaluation = {name: leaf for name, leaf in results.evaluation.items() if name[:4] not in ("best", "last")}
-    nothing = Results(study=study, run=results.run, agents=idle, evaluation=evaluation)
-    assert len(tables(nothing)) == 3
-    assert figures.run_figure(nothing)
+    untrained = Results(study=study, run=results.run, agents=agents, evaluation=evaluation)
+    assert len(tables(untrained)) == 3
+    assert figures.run_figure(untrained)
 
 
-def test_what_traffic_weighs_is_named_where_it_is_no_axis(results):
-    fined = (
+def test_traffic_weights_are_named_where_they_are_no_axes(results):
+    rows = (
         (results.agents.traffic_penalty > 0) & (results.agents.traffic_bonus == 0) & (results.agents.place == "albany")
     )
     study = load_study(
         "table7", {"place": "albany", "traffic_penalty": 300.0, "axes": {"cells": [[8, 6]], "seeds": 10}}
     )
-    agents = results.agents[fined].drop(columns=["place", "traffic_penalty", "traffic_bonus"]).reset_index(drop=True)
-    evaluation = {name: leaf[fined.to_numpy()] for name, leaf in results.evaluation.items()}
-    alone = Results(study=study, run=results.run, agents=agents, evaluation=evaluation)
-    assert set(first_failure_counts(alone)["traffic_penalty"]) == {300.0}
+    agents = results.agents[rows].drop(columns=["place", "traffic_penalty", "traffic_bonus"]).reset_index(drop=True)
+    evaluation = {name: leaf[rows.to_numpy()] for name, leaf in results.evaluation.items()}
+    without_axes = Results(study=study, run=results.run, agents=agents, evaluation=evaluation)
+    assert set(first_failure_counts(without_axes)["traffic_penalty"]) == {300.0}
     console = Console(width=160, record=True, file=io.StringIO())
-    for title, table in tables(alone).items():
+    for title, table in tables(without_axes).items():
         assert title.startswith(("Lifetime", "albany: first failures"))
         console.print(table)
     text = console.export_text()
@@ -158,11 +159,11 @@ def test_figure(results, tmp_path):
 
 def test_sign_test_is_the_exact_one():
     differences = np.array([-1, -1, -0.5, 0, 0.25, -2, 0, -1e-9])
-    found = sign_test(differences)
-    assert (found.fewer, found.more, found.same) == (4, 1, 3)
-    assert_allclose(found.p_value, stats.binomtest(4, 5).pvalue)
-    assert_allclose(found.g, 0.3)
-    # Under chance p-values are not too small: exact, so at most 5 % of them are below 0.05.
+    result = sign_test(differences)
+    assert (result.fewer, result.more, result.same) == (4, 1, 3)
+    assert_allclose(result.p_value, stats.binomtest(4, 5).pvalue)
+    assert_allclose(result.g, 0.3)
+    # Under the null hypothesis at most 5 % of exact p-values are below 0.05.
     rng = np.random.default_rng(0)
     p_values = [sign_test(rng.choice([-1.0, 0.0, 1.0], 30)).p_value for _ in range(400)]
     assert np.mean(np.array(p_values) < 0.05) <= 0.06

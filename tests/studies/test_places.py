@@ -1,6 +1,6 @@
-"""Studies of places: positions, traffic, rewards; and what does not fit."""
+"""Studies of places: positions, traffic and rewards; bad settings are refused in one line."""
 
-import jax
+import chex
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -13,6 +13,7 @@ from uavmec_jax.runs.run import run_study
 from uavmec_jax.runs.run_plan import plan_run
 from uavmec_jax.scenarios.load import load_scenario
 from uavmec_jax.scenarios.policies import load_policy
+from uavmec_jax.scenarios.seeds import held_out_draws
 from uavmec_jax.studies.population import cell_axes, make_agent_ids, make_agents
 from uavmec_jax.studies.study import load_study, parse_study, study_toml
 from uavmec_jax.traffic.evacuation import load_evacuation
@@ -34,29 +35,29 @@ planners = ["rollout"]
 """
 
 
-def test_agents_stand_where_the_devices_of_the_place_do():
+def test_devices_have_the_positions_and_the_traffic_of_the_place():
     study = parse_study(TOML, "x")
     assert cell_axes(study) == ["powered", "connected", "place", "traffic_bonus"]
-    who, agents = make_agent_ids(study), make_agents(study)
+    agent_ids, agents = make_agent_ids(study), make_agents(study)
     places = {name: load_evacuation(name) for name in ("round_lake", "albany")}
-    for k, agent in enumerate(who):
-        place = places[agent["place"]]
-        assert_allclose(agents.scenario.layout.position[k], place.local_position(), atol=1e-3)
-        assert_array_equal(agents.scenario.layout.traffic.weight[k], place.weight[None])
-    assert_array_equal(agents.scenario.reward.traffic_bonus, [agent["traffic_bonus"] for agent in who])
+    for i, agent_id in enumerate(agent_ids):
+        place = places[agent_id["place"]]
+        assert_allclose(agents.scenario.layout.position[i], place.local_position(), atol=1e-3)
+        assert_array_equal(agents.scenario.layout.traffic.weight[i], place.weight[None])
+    assert_array_equal(agents.scenario.reward.traffic_bonus, [agent_id["traffic_bonus"] for agent_id in agent_ids])
     assert_array_equal(agents.scenario.reward.traffic_penalty, 0)
-    assert {leaf.shape[0] for leaf in jax.tree.leaves(agents)} == {8}
+    chex.assert_tree_shape_prefix(agents, (8,))
 
 
-def test_hardware_and_masks_are_those_of_the_seeds_random_town():
-    towns = parse_study("[axes]\npowered = [8]\nconnected = [6]\nseeds = 2", "x")
-    ours, random = make_agents(parse_study(TOML, "x")).scenario.layout, make_agents(towns).scenario.layout
+def test_hardware_and_masks_are_those_of_the_seeds_random_layout():
+    study = parse_study("[axes]\npowered = [8]\nconnected = [6]\nseeds = 2", "x")
+    in_place, random = make_agents(parse_study(TOML, "x")).scenario.layout, make_agents(study).scenario.layout
     for name in ("capacity", "has_power", "has_comms", "device_type", "task"):
-        assert_array_equal(getattr(ours, name)[::4], getattr(random, name))
+        assert_array_equal(getattr(in_place, name)[::4], getattr(random, name))
     assert random.traffic is None
 
 
-def test_moving_weights_and_a_place_of_ones_own(tmp_path):
+def test_moving_weights_and_places_from_files(tmp_path):
     evacuation().save(tmp_path / "a.npz")
     evacuation(windows=((0, 0, 0), (0, 1, 0), (0, 0, 0.5))).save(tmp_path / "b.npz")
     changes = {
@@ -66,14 +67,16 @@ def test_moving_weights_and_a_place_of_ones_own(tmp_path):
     }
     traffic = make_agents(parse_study(TOML, "x", changes | {"traffic": "moving"})).scenario.layout.traffic
     assert traffic.weight.shape == (8, 3, 3)
-    assert_allclose(traffic.weight[0], [[0, 0.2, 0.1], [1, 0.4, 0.1], [1, 0.4, 0.1]])  # the last window lasts
+    assert_allclose(
+        traffic.weight[0], [[0, 0.2, 0.1], [1, 0.4, 0.1], [1, 0.4, 0.1]]
+    )  # the last window lasts to the end
     assert_allclose(traffic.weight[2, 2], [0, 0, 0.5])
     assert_allclose(traffic.window_s, 600)
     scaled = make_agents(parse_study(TOML, "x", changes | {"place_scale_m": 800.0})).scenario.layout
     assert_allclose(scaled.position.max(), 800)
 
 
-def test_a_study_of_places_is_written_and_read_back():
+def test_study_round_trip():
     study = parse_study(TOML, "x", {"place_scale_m": 800.0, "traffic": "moving"})
     assert parse_study(study_toml(study), "x") == study
     assert parse_study(study_toml(parse_study(TOML, "x")), "x") == parse_study(TOML, "x")
@@ -101,11 +104,11 @@ def test_a_study_of_places_is_written_and_read_back():
     ],
     ids=str,
 )
-def test_what_does_not_fit_is_one_line(changes, line):
-    with pytest.raises((StudyError, TrafficError)) as caught:
+def test_bad_setting_is_refused_in_one_line(changes, line):
+    with pytest.raises((StudyError, TrafficError)) as error:
         plan_run(parse_study(TOML, "x", changes))
-    assert line in str(caught.value)
-    assert "\n" not in str(caught.value)
+    assert line in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 def test_traffic_without_a_place_is_refused():
@@ -115,16 +118,18 @@ def test_traffic_without_a_place_is_refused():
             parse_study(plain, "x", {name: value})
 
 
-def test_a_scenario_of_a_place():
-    named_scenario, keys = load_scenario(None, place="albany", powered=8, connected=6, seed=3, draws=2)
+def test_random_scenario_in_a_place():
+    scenario = load_scenario(place="albany", powered=8, connected=6, seed=3)
     place = load_evacuation("albany")
-    assert named_scenario.names == place.meta["names"]
-    assert_allclose(named_scenario.layout.position, place.local_position(), atol=1e-3)
-    assert named_scenario.params.region_m == pytest.approx(place.region_m())
-    assert int(np.sum(named_scenario.layout.has_power)) == 8
-    assert keys.shape == (2,)
+    assert scenario.name == "albany, 8 powered, 6 connected, seed 3"
+    assert scenario.device_names == place.meta["names"]
+    assert_allclose(scenario.layout.position, place.local_position(), atol=1e-3)
+    assert_array_equal(scenario.layout.traffic.weight, place.weight[None])
+    assert scenario.params.region_m == pytest.approx(place.region_m())
+    assert int(np.sum(scenario.layout.has_power)) == 8
+    chex.assert_trees_all_equal(scenario.draws(2), held_out_draws(3, 8, 6, 2))
     with pytest.raises(TrafficError, match="slot_cap_s"):
-        load_scenario(None, place="albany", settings={"uav_speed_m_s": 1.0})
+        load_scenario(place="albany", settings={"uav_speed_m_s": 1.0})
 
 
 @pytest.mark.slow
@@ -143,7 +148,7 @@ def test_a_run_from_end_to_end(tmp_path):
     )
     assert len(fixed.agents) == 1
     assert load_policy(tmp_path / "fixed", place="albany").trained_on["place"] == "albany"
-    # AgentIds learns nothing plays the same whatever a learner is paid for.
+    # The results of a heuristic do not depend on the rewards of the trained agents.
     oldest = results.agents.pivot_table(
         index=["seed", "place"], columns="traffic_bonus", values="oldest_first_lifetime"
     )

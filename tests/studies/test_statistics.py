@@ -1,4 +1,4 @@
-"""Means and intervals."""
+"""Means and their intervals."""
 
 import numpy as np
 from numpy.testing import assert_allclose

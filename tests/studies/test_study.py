@@ -1,5 +1,6 @@
-"""Study files: good ones become populations, bad ones one clear line."""
+"""Study files: valid ones become populations, others are refused in one line."""
 
+import chex
 import jax
 import numpy as np
 import pytest
@@ -7,7 +8,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from uavmec_jax.env.rewards import REWARDS
 from uavmec_jax.errors import StudyError
-from uavmec_jax.studies import study as studies
 from uavmec_jax.studies.paper import TABLE6
 from uavmec_jax.studies.population import (
     evaluation_keys,
@@ -18,7 +18,7 @@ from uavmec_jax.studies.population import (
     split_by_algorithm,
     validation_keys,
 )
-from uavmec_jax.studies.study import load_study, parse_study, study_toml
+from uavmec_jax.studies.study import load_study, parse_study, shipped_studies, study_toml
 
 SMALL = """
 steps = 400
@@ -29,7 +29,7 @@ seeds = 2
 """
 
 
-@pytest.mark.parametrize("name", sorted(studies.shipped_studies()))
+@pytest.mark.parametrize("name", sorted(shipped_studies()))
 def test_shipped_studies_are_valid_and_round_trip(name):
     study = load_study(name)
     assert study.name == name
@@ -51,38 +51,38 @@ def test_table5_is_the_paper():
 
 def test_population_is_the_product_of_the_axes():
     study = parse_study(SMALL, "small", {"axes.learning_rate": [0.01, 0.001, 0.1], "axes.reward": ["A", "U"]})
-    who = make_agent_ids(study)
-    assert len(who) == 2 * 2 * 3 * 2
-    assert list(who[0]) == ["seed", "powered", "connected", "learning_rate", "reward"]
+    agent_ids = make_agent_ids(study)
+    assert len(agent_ids) == 2 * 2 * 3 * 2
+    assert list(agent_ids[0]) == ["seed", "powered", "connected", "learning_rate", "reward"]
     agents = make_agents(study)
-    assert_array_equal(agents.hyper.learning_rate, np.float32([agent["learning_rate"] for agent in who]))
-    assert_array_equal(agents.scenario.layout.has_power.sum(axis=1), [agent["powered"] for agent in who])
+    assert_array_equal(agents.hyper.learning_rate, np.float32([agent["learning_rate"] for agent in agent_ids]))
+    assert_array_equal(agents.scenario.layout.has_power.sum(axis=1), [agent["powered"] for agent in agent_ids])
     assert_array_equal(agents.scenario.reward.weights[0], [1, 0, 0, 0, 0, 0, 0, 0])
     assert_array_equal(agents.scenario.reward.weights[1], [0, 1, 0, 0, 0, 0, 0, 0])
-    leaves = jax.tree.leaves(agents)
-    assert {leaf.shape[0] for leaf in leaves} == {24}
+    chex.assert_tree_shape_prefix(agents, (24,))
 
 
-def test_an_agent_is_who_it_is_whoever_trains_beside_it():
+def test_an_agent_does_not_depend_on_the_other_agents():
     few, many = parse_study(SMALL, "x"), parse_study(SMALL, "x", {"axes.powered": [12, 8, 4], "axes.seeds": [7, 1]})
-    place = [(i, j) for i, a in enumerate(make_agent_ids(few)) for j, b in enumerate(make_agent_ids(many)) if a == b]
-    assert len(place) == 2  # seed 1, powered 8 and 4
-    mine, theirs = ([p[k] for p in place] for k in (0, 1))
-    for make in (lambda s: make_agents(s).scenario.layout.position, lambda s: jax.random.key_data(make_agents(s).key)):
-        assert_array_equal(make(few)[np.array(mine)], make(many)[np.array(theirs)])
-    for keys in (validation_keys, evaluation_keys):
-        data = [jax.random.key_data(keys(s)) for s in (few, many)]
-        assert_array_equal(data[0][np.array(mine)], data[1][np.array(theirs)])
+    all_few, all_many = make_agent_ids(few), make_agent_ids(many)
+    shared = [agent_id for agent_id in all_few if agent_id in all_many]
+    assert len(shared) == 2  # seed 1, powered 8 and 4
+    rows_few, rows_many = ([ids.index(agent_id) for agent_id in shared] for ids in (all_few, all_many))
+    for make in (make_agents, validation_keys, evaluation_keys):
+        in_few = jax.tree.map(lambda leaf: leaf[np.array(rows_few)], make(few))
+        in_many = jax.tree.map(lambda leaf: leaf[np.array(rows_many)], make(many))
+        chex.assert_trees_all_equal(in_few, in_many)
 
 
 def test_draws_for_training_validation_and_evaluation_are_different():
     study = parse_study(SMALL, "x")
-    agents, looks, judged = make_agents(study).key, validation_keys(study), evaluation_keys(study)
-    assert judged.shape == (4, 33)
-    numbers = [jax.random.key_data(keys).reshape(-1, 2) for keys in (agents, looks, judged[:, :-1])]
-    together = np.concatenate(numbers)
-    assert len(np.unique(together, axis=0)) == len(together)
-    fixed = jax.random.key_data(judged[:, -1])
+    training, validation, evaluation = make_agents(study).key, validation_keys(study), evaluation_keys(study)
+    assert evaluation.shape == (4, 33)
+    keys = np.concatenate(
+        [jax.random.key_data(keys).reshape(-1, 2) for keys in (training, validation, evaluation[:, :-1])]
+    )
+    assert len(np.unique(keys, axis=0)) == len(keys)
+    fixed = jax.random.key_data(evaluation[:, -1])
     assert len(np.unique(fixed, axis=0)) == 1
 
 
@@ -94,9 +94,7 @@ def test_scenario_parameters_and_devices_are_settings():
     assert agents.scenario.layout.position.shape == (8, 20, 2)
     assert agents.scenario.layout.position[..., 1].max() <= 300
     assert_array_equal(agents.scenario.params.uav_speed_m_s, [5, 10] * 4)
-    assert (
-        agents.scenario.params.uav_speed_m_s.dtype == np.float32
-    )  # whole numbers in the file, real ones in the program
+    assert agents.scenario.params.uav_speed_m_s.dtype == np.float32  # although the file has whole numbers
 
 
 BAD = [
@@ -156,14 +154,14 @@ BAD = [
     ({"algorithm": "a2c", "a2c.gae_lambda": 1.5}, "bad.toml: a2c.gae_lambda is 1.5; it should be less than or equal"),
     ({"dqn.n_step": 0}, "bad.toml: dqn.n_step is 0; it should be greater than or equal to 1"),
     ({"dqn.tau": 0.0}, "bad.toml: dqn.tau is 0.0; it should be greater than 0"),
-    ({"axes.cells": [[8, 8]]}, "bad.toml: axes.cells stands beside axes.powered or axes.connected; give"),
+    ({"axes.cells": [[8, 8]]}, "bad.toml: axes.cells is given, and axes.powered or axes.connected too; give"),
     (
         {"evaluation.planners": ["oracle"]},
         "bad.toml: evaluation.planners.0 is 'oracle'; it should be 'rollout', 'beam'",
     ),
     (
         {"algorithm": "none", "evaluation.baselines": [], "evaluation.planners": []},
-        "bad.toml: algorithm is 'none' and evaluation has neither baselines nor planners; name one to judge",
+        "bad.toml: algorithm is 'none' and evaluation has neither baselines nor planners; name one to evaluate",
     ),
     ({"evaluation.beam_width": 0}, "bad.toml: evaluation.beam_width is 0; it should be greater than or equal to 1"),
     ({"evaluation.planner_draws": 0}, "bad.toml: evaluation.planner_draws is 0; it should be greater"),
@@ -172,7 +170,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("change", "message"), BAD, ids=[message[10:50] for _, message in BAD])
-def test_bad_setting_is_one_clear_line(change, message):
+def test_bad_setting_is_refused_in_one_line(change, message):
     with pytest.raises(StudyError) as error:
         parse_study(SMALL, "bad.toml", change)
     assert str(error.value).startswith(message)
@@ -186,10 +184,10 @@ def test_missing_axis():
         parse_study("steps = 10", "x")
 
 
-def test_not_toml_and_not_there(tmp_path):
+def test_not_toml_and_missing_file(tmp_path):
     with pytest.raises(StudyError, match="x: not TOML"):
         parse_study("steps = = 3", "x")
-    with pytest.raises(StudyError, match=r"neither a study file nor a shipped_studies study; did you mean 'table5'"):
+    with pytest.raises(StudyError, match=r"neither a study file nor a shipped study; did you mean 'table5'"):
         load_study("tabel5")
     with pytest.raises(StudyError, match="no such file"):
         load_study(tmp_path / "none.toml")
@@ -217,24 +215,23 @@ def test_bad_cells(cells, message):
 
 def test_cells_are_pairs():
     study = parse_study(CELLS, "x")
-    who = make_agent_ids(study)
-    assert [(one["seed"], one["powered"], one["connected"]) for one in who] == [
+    assert [tuple(agent_id.values()) for agent_id in make_agent_ids(study)] == [
         (0, 6, 6), (0, 10, 8), (2, 6, 6), (2, 10, 8)
     ]  # fmt: skip
     assert n_agents(study) == 4
     assert parse_study(study_toml(study), "again") == study
 
 
-def test_algorithms_are_cut_into_parts_of_one_program_each():
+def test_a_study_of_several_algorithms_is_split_by_algorithm():
     study = parse_study(CELLS, "x", {"axes.algorithm": ["a2c", "dqn"], "axes.gamma": [0.9, 0.98], "a2c.vf_coef": 0.3})
     assert n_agents(study) == len(make_agent_ids(study)) == 16
-    assert [one["algorithm"] for one in make_agent_ids(study)] == ["a2c"] * 8 + ["dqn"] * 8
+    assert [agent_id["algorithm"] for agent_id in make_agent_ids(study)] == ["a2c"] * 8 + ["dqn"] * 8
     a2c, dqn = split_by_algorithm(study)
     assert (make_algorithm(a2c).name, make_algorithm(dqn).name) == ("a2c", "dqn")
     agents, others = make_agents(a2c), make_agents(dqn)
     assert_array_equal(agents.hyper.gamma, np.tile(np.float32([0.9, 0.98]), 4))
     assert_allclose(agents.hyper.vf_coef, 0.3)
-    # the same towns, draws and keys, whoever learns
+    # layouts and keys are the same under every algorithm
     assert_array_equal(agents.scenario.layout.position, others.scenario.layout.position)
     assert_array_equal(jax.random.key_data(agents.key), jax.random.key_data(others.key))
     assert parse_study(study_toml(study), "again") == study
@@ -243,7 +240,7 @@ def test_algorithms_are_cut_into_parts_of_one_program_each():
 def test_a_reward_without_ages_in_logarithms_has_one_guard():
     rewards = ["A", "log A", "log M", {"log O": -1.0}]
     study = parse_study(CELLS, "x", {"axes.reward": rewards[:3], "axes.guard": ["log1p", "clamp"]})
-    pairs = {(one["reward"], one["guard"]) for one in make_agent_ids(study)}
+    pairs = {(agent_id["reward"], agent_id["guard"]) for agent_id in make_agent_ids(study)}
     assert pairs == {("A", "log1p"), ("log A", "log1p"), ("log A", "clamp"), ("log M", "log1p")}
     assert n_agents(study) == len(make_agent_ids(study)) == 4 * 4
     assert not make_agents(study).scenario.reward.log1p.all()
@@ -253,6 +250,6 @@ def test_table6_is_the_papers_table():
     study = load_study("table6")
     assert n_agents(study) == 3 * 3 * 5 * (11 + 4)
     assert study.axes["reward"] == list(REWARDS)
-    wanted = {(one["reward"], one["powered"], one["connected"], one["algorithm"]) for one in make_agent_ids(study)}
-    assert wanted == set(TABLE6)
+    axes = ("reward", "powered", "connected", "algorithm")
+    assert {tuple(agent_id[axis] for axis in axes) for agent_id in make_agent_ids(study)} == set(TABLE6)
     assert max(TABLE6.values()) == 30  # U+log(A/O), 10 powered, 8 connected, DQN

@@ -13,7 +13,8 @@ from uavmec_jax.agents.algorithm import Agent, Algorithm
 from uavmec_jax.env.rewards import Reward, make_reward
 from uavmec_jax.runs.run_plan import RunPlan, Shard
 from uavmec_jax.studies.axes import TRACED_PARAMS
-from uavmec_jax.studies.evaluation import DistinctScenarios, EvaluationResult, evaluate_all, evaluate_learned
+from uavmec_jax.studies.evaluation import DistinctScenarios, evaluate_all, evaluate_learned
+from uavmec_jax.studies.evaluation_result import EvaluationResult
 from uavmec_jax.studies.population import (
     AgentId,
     evaluation_keys,

@@ -1,4 +1,4 @@
-"""The axes of a study: which there are, and which values they may have."""
+"""The axes of a study and the values that they may have."""
 
 import dataclasses
 import math
@@ -42,40 +42,20 @@ def check_reward(where: str, reward: Any) -> None:
 
 def traced_settings(study: Any) -> tuple[str, ...]:
     """Return the hyperparameters that may be axes of a study: those that all its algorithms have."""
-    shared = [ALGORITHMS[name].traced for name in study.algorithms] or [ALGORITHMS["dqn"].traced]
-    return tuple(name for name in shared[0] if all(name in others for others in shared))
-
-
-def _check_known(study: Any, name: str) -> None:
-    known = (*_OTHER_AXES, *traced_settings(study), *TRACED_PARAMS)
-    if name in known:
-        return
-    for algorithm in study.algorithms:
-        everywhere = {name for registered in ALGORITHMS.values() for name in registered.traced}
-        if name in everywhere - set(ALGORITHMS[algorithm].traced):
-            has = ", ".join(ALGORITHMS[algorithm].traced)
-            raise ValueError(f"axes.{name} is not a hyperparameter of {algorithm}, which has {has}")
-    raise ValueError(f"axes.{name} is not an axis; {suggest(name, known)}")
+    traced = [ALGORITHMS[name].traced for name in study.algorithms or ("dqn",)]
+    return tuple(name for name in traced[0] if all(name in others for others in traced))
 
 
 def check_axes(study: Any) -> None:
-    """Check that every axis is known, not empty, without repeats, and that its values would be valid settings.
+    """Check that all axes exist and fit together, and that their values are valid, at least one and without repeats.
 
     Raises:
         ValueError: one line that names the axis.
     """
-    if "cells" in study.axes and {"powered", "connected"} & set(study.axes):
-        raise ValueError("axes.cells stands beside axes.powered or axes.connected; give the pairs or the two lists")
-    counts = ("powered", "connected", "cells")
-    if study.scenarios is not None and (given := [name for name in counts if name in study.axes]):
-        raise ValueError(f"axes.{given[0]} is given, and scenarios too, which draw their own; leave one of them out")
-    drawn_or_cells = "cells" in study.axes or study.scenarios is not None
-    for name in ("seeds",) if drawn_or_cells else ("powered", "connected", "seeds"):
-        if name not in study.axes:
-            raise ValueError(f"axes.{name} is missing; give a list of whole numbers")
+    _check_combination(study)
     for name, values in study.axes.items():
         where = f"axes.{name}"
-        _check_known(study, name)
+        _check_name(study, name)
         if name == "seeds" and isinstance(values, int) and not isinstance(values, bool):
             if not 1 <= values < 2**31:
                 raise ValueError(f"{where} is {values}; give at least 1 seed, and fewer than 2**31")
@@ -85,45 +65,83 @@ def check_axes(study: Any) -> None:
         if not values:
             raise ValueError(f"{where} is empty; give at least one value")
         for value in values:
-            _check_value(study, name, where, value)
-        if any(value in values[:place] for place, value in enumerate(values)):
+            _check_value(study, name, value)
+        if any(value in values[:index] for index, value in enumerate(values)):
             raise ValueError(f"{where} repeats a value: {values}")
 
 
-def _check_value(study: Any, name: str, where: str, value: Any) -> None:
-    n = study.params.n_devices
-    whole = isinstance(value, int) and not isinstance(value, bool)
-    if name in ("powered", "connected"):
-        if not whole or not 0 <= value <= n:
-            raise ValueError(f"{where} has {value!r}; give whole numbers from 0 to {n}, the number of devices")
-    elif name == "cells":
-        if not isinstance(value, list) or len(value) != 2:
-            raise ValueError(f"{where} has {value!r}; give pairs [powered, connected]")
-        for part in value:
-            _check_value(study, "powered", where, part)
-    elif name == "algorithm":
-        if study.algorithm == "none":
-            raise ValueError(f"{where} is given, but algorithm is 'none'; leave one of them out")
-        if value not in ALGORITHMS:
-            raise ValueError(f"{where} has {value!r}; known: {', '.join(ALGORITHMS)}")
-    elif name == "seeds":
-        if not whole or not 0 <= value < 2**31:
-            raise ValueError(f"{where} has {value!r}; give whole numbers from 0 to 2147483647")
-    elif name == "reward":
+def _check_combination(study: Any) -> None:
+    """Check that no axis of cells and seeds is missing or given twice."""
+    if "cells" in study.axes and {"powered", "connected"} & set(study.axes):
+        raise ValueError("axes.cells is given, and axes.powered or axes.connected too; give the pairs or the two lists")
+    counts = ("powered", "connected", "cells")
+    if study.scenarios is not None and (given := [name for name in counts if name in study.axes]):
+        raise ValueError(f"axes.{given[0]} is given, and scenarios too, which draw their own; leave one of them out")
+    cells_known = "cells" in study.axes or study.scenarios is not None
+    for name in ("seeds",) if cells_known else ("powered", "connected", "seeds"):
+        if name not in study.axes:
+            raise ValueError(f"axes.{name} is missing; give a list of whole numbers")
+
+
+def _check_name(study: Any, name: str) -> None:
+    """Check that an axis exists."""
+    axes = (*_OTHER_AXES, *traced_settings(study), *TRACED_PARAMS)
+    if name in axes:
+        return
+    hyperparameters = {setting for registered in ALGORITHMS.values() for setting in registered.traced}
+    for algorithm in study.algorithms:
+        traced = ALGORITHMS[algorithm].traced
+        if name in hyperparameters.difference(traced):
+            raise ValueError(f"axes.{name} is not a hyperparameter of {algorithm}, which has {', '.join(traced)}")
+    raise ValueError(f"axes.{name} is not an axis; {suggest(name, axes)}")
+
+
+def _check_value(study: Any, name: str, value: Any) -> None:
+    """Check one value of an axis."""
+    where = f"axes.{name}"
+    if name == "algorithm" and study.algorithm == "none":
+        raise ValueError(f"{where} is given, but algorithm is 'none'; leave one of them out")
+    if name == "reward":
         check_reward(where, value if isinstance(value, str) else str(value))
-    elif name == "guard":
-        if value not in LOG_GUARDS:
-            raise ValueError(f"{where} has {value!r}; {suggest(str(value), LOG_GUARDS)}")
-    elif name == "place":
-        if not isinstance(value, str) or not value:
-            raise ValueError(f"{where} has {value!r}; give names of places or paths of their files")
-    elif name in TRAFFIC_WEIGHTS:
-        if not isinstance(value, int | float) or isinstance(value, bool) or not 0 <= value < math.inf:
-            raise ValueError(f"{where} has {value!r}; give finite numbers from 0")
-    else:
-        own = [type(getattr(study, algorithm)) for algorithm in study.algorithms or ("dqn",)]
-        for settings in own if name in traced_settings(study) else [ParamsSettings]:
-            try:
-                settings(**{name: value})
-            except pydantic.ValidationError as error:
-                raise ValueError(f"{where} has {value!r}; {expectation(error.errors()[0])}") from None
+        return
+    is_pair = name == "cells" and isinstance(value, list) and len(value) == 2
+    for axis, part in [("powered", count) for count in value] if is_pair else [(name, value)]:
+        if expected := _expected(study, axis, part):
+            raise ValueError(f"{where} has {part!r}; {expected}")
+
+
+def _expected(study: Any, name: str, value: Any) -> str:
+    """Return what would be right if a value does not fit its axis; empty if it fits."""
+    n = study.params.n_devices
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    is_whole = is_number and isinstance(value, int)
+    match name:
+        case "powered" | "connected":
+            fits, expected = is_whole and 0 <= value <= n, f"give whole numbers from 0 to {n}, the number of devices"
+        case "cells":
+            fits, expected = False, "give pairs [powered, connected]"
+        case "algorithm":
+            fits, expected = value in tuple(ALGORITHMS), f"known: {', '.join(ALGORITHMS)}"
+        case "seeds":
+            fits, expected = is_whole and 0 <= value < 2**31, "give whole numbers from 0 to 2147483647"
+        case "guard":
+            fits, expected = value in LOG_GUARDS, suggest(str(value), LOG_GUARDS)
+        case "place":
+            fits, expected = isinstance(value, str) and value != "", "give names of places or paths of their files"
+        case "traffic_bonus" | "traffic_penalty":
+            fits, expected = is_number and 0 <= value < math.inf, "give finite numbers from 0"
+        case _:
+            return _expected_setting(study, name, value)
+    return "" if fits else expected
+
+
+def _expected_setting(study: Any, name: str, value: Any) -> str:
+    """Return what would be right if a value does not fit a hyperparameter or scenario parameter; empty if it fits."""
+    algorithms = study.algorithms or ("dqn",)
+    models = [type(getattr(study, algorithm)) for algorithm in algorithms]
+    for model in models if name in traced_settings(study) else [ParamsSettings]:
+        try:
+            model(**{name: value})
+        except pydantic.ValidationError as error:
+            return expectation(error.errors()[0])
+    return ""

@@ -1,7 +1,7 @@
-"""Two runs side by side: paired differences, interquartile mean, probability of improvement.
+"""Compare two runs: paired differences, interquartile means and the probability of improvement.
 
-The last two as Agarwal et al. (2021), "Deep reinforcement learning at the edge of the statistical precipice", define them
-and their library rliable computes them: a cell is a task, a seed is a run.
+The last two are those of Agarwal et al. (2021), "Deep reinforcement learning at the edge of the statistical precipice", and
+their library rliable, where a cell is a task and a seed is a run.
 """
 
 from collections.abc import Callable, Mapping
@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Num
 from scipy import stats
 
 from uavmec_jax.errors import StudyError
@@ -19,15 +20,18 @@ from uavmec_jax.studies.statistics import CONFIDENCE, mean_interval
 
 _RESAMPLES = 2000
 
+_Interval = tuple[float, float, float]
+"""``(value, low, high)``."""
+
 
 @dataclass(frozen=True)
 class Side:
     """One side of a comparison.
 
     Attributes:
-        results: the run.
-        policy: whose lifetimes, as in the column names: ``best``, ``last``, ``oldest_first``, ...
-        where: agents to keep, by their values on some axes.
+        results: results of the run.
+        policy: name of the policy that is compared: ``best``, ``last``, ``oldest_first``, ...
+        where: values on some axes; only agents that have them are compared.
     """
 
     results: Results
@@ -36,20 +40,20 @@ class Side:
 
     @property
     def name(self) -> str:
-        """How the side is called in tables."""
-        chosen = ", ".join(f"{axis}={value}" for axis, value in self.where.items())
-        return f"{self.results.study.name} {self.policy}{f' ({chosen})' if chosen else ''}"
+        """Name of the side in tables."""
+        values = ", ".join(f"{axis}={value}" for axis, value in self.where.items())
+        return f"{self.results.study.name} {self.policy}{f' ({values})' if values else ''}"
 
     def lifetimes(self) -> pd.DataFrame:
-        """The kept agents, with their lifetime in ``lifetime``.
+        """Return the agents that are compared: their values on all axes, and ``lifetime``.
 
         Raises:
-            StudyError: there is no such policy, or no such agent.
+            StudyError: there is no such policy, axis or agent.
         """
         agents, column = self.results.agents, f"{self.policy.replace('-', '_')}_lifetime"
         if column not in agents:
-            known = ", ".join(name.replace("_", "-") for name in self.results.policies)
-            raise StudyError(f"{self.results.study.name}: has no policy {self.policy!r}; it has {known}")
+            policies = ", ".join(name.replace("_", "-") for name in self.results.policies)
+            raise StudyError(f"{self.results.study.name}: has no policy {self.policy!r}; it has {policies}")
         axes = ["seed", *cell_axes(self.results.study)]
         for axis, value in self.where.items():
             if axis not in axes:
@@ -61,17 +65,19 @@ class Side:
 
 
 def pair(a: Side, b: Side) -> tuple[pd.DataFrame, list[str]]:
-    """The agents that both sides have, one row each with ``lifetime_a`` and ``lifetime_b``; and the axes of a cell.
+    """Match the agents of two sides.
+
+    Returns:
+        The agents that both sides have, one row each, with ``lifetime_a`` and ``lifetime_b``; and the axes of a cell.
 
     Raises:
-        StudyError: they have none in common, or an agent of one fits several of the other.
+        StudyError: the sides have no agents in common, or an agent of one matches several of the other.
     """
     left, right = a.lifetimes(), b.lifetimes()
-    pinned = {axis for axis in a.where if axis in b.where}  # each side has one value there, not always the same
+    pinned = {axis for axis in a.where if axis in b.where}  # each side has one value there, which may differ
     shared = [str(axis) for axis in left if axis in set(right) - {"lifetime"} - pinned]
     for side, table in ((a, left), (b, right)):
-        twice = table[table.duplicated(shared)]
-        if len(twice):
+        if table.duplicated(shared).any():
             others = [str(axis) for axis in table if axis not in (*shared, *pinned, "lifetime")]
             free = [axis for axis in others if table[axis].nunique() > 1]
             raise StudyError(f"{side.name}: several agents fit one of the other run; say which of {', '.join(free)}")
@@ -83,7 +89,7 @@ def pair(a: Side, b: Side) -> tuple[pd.DataFrame, list[str]]:
 
 
 def differences(both: pd.DataFrame, cells: list[str]) -> pd.DataFrame:
-    """Per cell: seeds, mean lifetime of both, and the paired difference b - a with its 95 % interval over the seeds."""
+    """Return one row per cell: seeds, mean lifetimes, and the paired difference b - a with its 95 % interval over seeds."""
     rows = []
     for cell, group in both.groupby(cells, sort=False):
         mean, low, high = mean_interval((group["lifetime_b"] - group["lifetime_a"]).to_numpy())
@@ -93,37 +99,39 @@ def differences(both: pd.DataFrame, cells: list[str]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def overall(both: pd.DataFrame, cells: list[str]) -> dict[str, tuple[float, float, float]]:
-    """Aggregates over all cells with stratified bootstrap intervals: ``(value, low, high)``.
+def overall(both: pd.DataFrame, cells: list[str]) -> dict[str, _Interval]:
+    """Aggregate over all cells, with 95 % intervals from a bootstrap that is stratified by cell.
 
-    ``difference``: mean paired difference b - a, slots. ``iqm_a``, ``iqm_b``: interquartile means, slots.
-    ``improvement``: probability that b lives longer than a on a random cell, ties counting half.
+    Returns:
+        ``difference``: mean paired difference b - a in slots; ``iqm_a``, ``iqm_b``: interquartile means in slots;
+        ``improvement``: probability that the lifetime of b is longer than that of a in a random cell, ties counting half.
     """
     groups = [group[["lifetime_a", "lifetime_b"]].to_numpy() for _, group in both.groupby(cells, sort=False)]
     measures: dict[str, Callable[[list[np.ndarray]], float]] = {
-        "difference": lambda drawn: float(np.concatenate(drawn).dot([-1.0, 1.0]).mean()),
-        "iqm_a": lambda drawn: interquartile_mean(np.concatenate(drawn)[:, 0]),
-        "iqm_b": lambda drawn: interquartile_mean(np.concatenate(drawn)[:, 1]),
-        "improvement": lambda drawn: float(
-            np.mean([probability_of_improvement(one[:, 1], one[:, 0]) for one in drawn])
+        "difference": lambda sample: float(np.concatenate(sample).dot([-1.0, 1.0]).mean()),
+        "iqm_a": lambda sample: interquartile_mean(np.concatenate(sample)[:, 0]),
+        "iqm_b": lambda sample: interquartile_mean(np.concatenate(sample)[:, 1]),
+        "improvement": lambda sample: float(
+            np.mean([probability_of_improvement(pairs[:, 1], pairs[:, 0]) for pairs in sample])
         ),
     }
     rng, tail = np.random.default_rng(0), 50 * (1 - CONFIDENCE)
-    resampled = [[one[rng.integers(len(one), size=len(one))] for one in groups] for _ in range(_RESAMPLES)]
-    found = {}
+    samples = [[pairs[rng.integers(len(pairs), size=len(pairs))] for pairs in groups] for _ in range(_RESAMPLES)]
+    single_seed = min(len(pairs) for pairs in groups) < 2
+    aggregates: dict[str, _Interval] = {}
     for name, measure in measures.items():
-        low, high = np.percentile([measure(drawn) for drawn in resampled], [tail, 100 - tail])
-        alone = min(len(one) for one in groups) < 2
-        found[name] = (measure(groups), *((float("nan"),) * 2 if alone else (float(low), float(high))))
-    return found
+        low, high = np.percentile([measure(sample) for sample in samples], [tail, 100 - tail])
+        interval = (float("nan"), float("nan")) if single_seed else (float(low), float(high))
+        aggregates[name] = (measure(groups), *interval)
+    return aggregates
 
 
-def interquartile_mean(values: np.ndarray) -> float:
-    """Mean of the middle half."""
+def interquartile_mean(values: Num[np.ndarray, " S"]) -> float:
+    """Return the mean of the middle half of the values."""
     return float(stats.trim_mean(values, 0.25))
 
 
-def probability_of_improvement(x: np.ndarray, y: np.ndarray) -> float:
-    """Share of the pairs in which ``x`` is above ``y``, ties counting half (Mann-Whitney's U over their number)."""
+def probability_of_improvement(x: Num[np.ndarray, " S"], y: Num[np.ndarray, " T"]) -> float:
+    """Return the share of pairs in which ``x`` is above ``y``, ties counting half (Mann-Whitney's U per pair)."""
     ranks = stats.rankdata(np.concatenate([x, y]))[: len(x)]
     return float((ranks.sum() - len(x) * (len(x) + 1) / 2) / (len(x) * len(y)))

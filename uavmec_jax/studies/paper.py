@@ -1,4 +1,4 @@
-"""What the paper reports, for the tables that stand beside ours (Azfar, Huang, Ke, arXiv 2501.15305)."""
+"""Numbers that the paper reports (Azfar, Huang, Ke, arXiv 2501.15305), for tables that compare ours with them."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -55,4 +55,4 @@ TABLE7: Mapping[str, tuple[int, ...]] = MappingProxyType(
         "albany": (0, 0, 0, 3, 0, 1, 6, 10, 5, 3, 2, 0),
     }
 )
-"""Table 7: place -> of 30 tests, how often each of the devices 1 to 12 failed first."""
+"""Table 7: place -> number of tests, of 30, in which each of the devices 1 to 12 failed first."""

@@ -1,4 +1,4 @@
-"""Studies of places: agents' layouts get the positions of a simulated evacuation and the traffic that its devices see."""
+"""Studies of places: layouts with the devices' positions in a simulated evacuation and the traffic around them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -15,18 +15,18 @@ from uavmec_jax.traffic.evacuation import Evacuation, load_evacuation
 
 
 def places_of(study: Study) -> tuple[str, ...]:
-    """The places of a study, by name or path; none if its towns are random."""
+    """Return the places of a study, by name or path; none if its positions are random."""
     return tuple(study.axes.get("place", [study.place] if study.place else []))
 
 
 def load_evacuations(study: Study) -> dict[str, Evacuation]:
-    """The evacuations of a study's places, by the names that the study gives them.
+    """Load the evacuations of a study's places, by the names that the study gives them.
 
     Raises:
         TrafficError: a place or its file is not usable, or a hop would take longer than a slot may.
         StudyError: a place has another number of devices than the study.
     """
-    found = {}
+    evacuations = {}
     for name in places_of(study):
         evacuation = load_evacuation(name)
         if evacuation.n_devices != study.params.n_devices:
@@ -34,37 +34,43 @@ def load_evacuations(study: Study) -> dict[str, Evacuation]:
                 f"{study.name}: place {name!r} has {evacuation.n_devices} devices, params.n_devices is "
                 f"{study.params.n_devices}; set params.n_devices = {evacuation.n_devices}"
             )
-        slowest = min(study.axes.get("uav_speed_m_s", [study.params.uav_speed_m_s]))
-        shortest = min(study.axes.get("slot_cap_s", [study.params.slot_cap_s]))
-        evacuation.check_hops(slowest, shortest, study.place_scale_m)
-        found[name] = evacuation
-    return found
+        lowest_speed = min(study.axes.get("uav_speed_m_s", [study.params.uav_speed_m_s]))
+        shortest_cap = min(study.axes.get("slot_cap_s", [study.params.slot_cap_s]))
+        evacuation.check_hops(lowest_speed, shortest_cap, study.place_scale_m)
+        evacuations[name] = evacuation
+    return evacuations
 
 
-def onto_places(layouts: Layout, agents: Sequence[Mapping[str, Any]], study: Study) -> Layout:
-    """Layouts ``[A, ...]`` of agents with their devices in the places of the study; unchanged if it has none.
+def move_to_places(layouts: Layout, agent_ids: Sequence[Mapping[str, Any]], study: Study) -> Layout:
+    """Give the devices of agents' layouts, leaves ``[A, ...]``, the positions and the traffic of the agents' places.
+
+    Args:
+        layouts: returned unchanged if the study has no places.
+        agent_ids: identities of the ``A`` agents.
+        study: the study.
 
     Raises:
         TrafficError, StudyError: see :func:`load_evacuations`.
     """
-    evacuations = load_evacuations(study)
-    if not evacuations:
+    by_name = load_evacuations(study)
+    if not by_name:
         return layouts
-    own = [evacuations[agent.get("place", study.place)] for agent in agents]
-    weights = [traffic_weights(evacuation, study.traffic == "moving") for evacuation in own]
-    windows = max(map(len, weights))  # the last window lasts
+    evacuations = [by_name[agent_id.get("place", study.place)] for agent_id in agent_ids]
+    weights = [traffic_weights(evacuation, study.traffic == "moving") for evacuation in evacuations]
+    windows = max(map(len, weights))
+    # The last window lasts to the end, so evacuations with fewer windows repeat theirs.
     padded = [np.pad(weight, ((0, windows - len(weight)), (0, 0)), mode="edge") for weight in weights]
     traffic = Traffic(
         weight=jnp.asarray(np.stack(padded)),
-        window_s=jnp.asarray([evacuation.meta["window_s"] for evacuation in own], jnp.float32),
-        price=jnp.zeros(len(own)),
+        window_s=jnp.asarray([evacuation.meta["window_s"] for evacuation in evacuations], jnp.float32),
+        price=jnp.zeros(len(evacuations)),
     )
-    position = np.stack([evacuation.local_position(study.place_scale_m) for evacuation in own])
+    position = np.stack([evacuation.local_position(study.place_scale_m) for evacuation in evacuations])
     return replace(layouts, position=jnp.asarray(position, jnp.float32), traffic=traffic)
 
 
 def describe_places(study: Study) -> dict[str, dict[str, Any]]:
-    """What the results of a study should know of its places: of each its devices' names, weights, and the network's hash.
+    """Describe the places of a study for its results: each one's network hash, and its devices' names and weights.
 
     Raises:
         TrafficError, StudyError: see :func:`load_evacuations`.

@@ -9,8 +9,11 @@ from jaxtyping import Array, Key
 from uavmec_jax.env.rollout import Policy, rollouts
 from uavmec_jax.planning.heuristics import HEURISTICS
 from uavmec_jax.scenarios.named_scenario import NamedScenario
-from uavmec_jax.studies.evaluation import device_number, evaluation_result, most_common_cause
+from uavmec_jax.studies.evaluation_result import EvaluationResult, most_common_cause, most_common_first_device
 from uavmec_jax.studies.statistics import mean_interval
+
+_BASELINES = ("oldest-first", "earliest-deadline")
+"""Heuristics that a policy is compared with."""
 
 
 def evaluate_policy(
@@ -18,32 +21,35 @@ def evaluate_policy(
 ) -> list[dict[str, Any]]:
     """Evaluate a policy, oldest-first and earliest-deadline on one scenario and the same draws.
 
+    Args:
+        policy: the policy.
+        name: name of the policy in the result.
+        scenario: where it is evaluated.
+        draws: volume draws.
+
     Returns:
-        One dictionary per policy: ``policy``, ``mean`` lifetime in slots with its 95 % interval ``low``, ``high`` over the
-        draws, ``shortest``, ``longest``, ``lifetimes``, most common ``cause``, ``first_device`` (from 1; 0: none fails) and
-        ``first_share``, the device that fails first most often.
+        One dictionary per policy: ``policy``, its name; ``mean`` lifetime in slots with the 95 % interval ``low``, ``high``
+        over the draws; ``shortest`` and ``longest`` lifetime; ``lifetimes``, all of them; the most common ``cause`` of
+        failure; ``first_device``, the number (from 1) of the device that fails first most often, 0 if none fails; and
+        ``first_share``, its share of the first failures.
     """
-    policies = {name: policy, **{baseline: HEURISTICS[baseline] for baseline in _BASELINES}}
-    return [{"policy": called, **_evaluate(player, scenario, draws)} for called, player in policies.items()]
+    policies = {name: policy} | {baseline: HEURISTICS[baseline] for baseline in _BASELINES}
+    return [{"policy": label, **_evaluate(each, scenario, draws)} for label, each in policies.items()]
 
 
 def _evaluate(policy: Policy, scenario: NamedScenario, draws: Key[Array, " D"]) -> dict[str, Any]:
-    played = jax.jit(partial(rollouts, policy))(scenario.params, scenario.layout, draws)
-    result = evaluation_result(jax.tree.map(lambda leaf: leaf[None], played))
-    mean, low, high = mean_interval(result.lifetime[0])
-    share = result.first_failure[0].mean(axis=0)
+    episodes = jax.jit(partial(rollouts, policy))(scenario.params, scenario.layout, draws)
+    result = EvaluationResult.of(jax.tree.map(lambda leaf: leaf[None], episodes))
+    lifetimes, share = result.lifetime[0], result.first_failure[0].mean(axis=0)
+    mean, low, high = mean_interval(lifetimes)
     return {
         "mean": mean,
         "low": low,
         "high": high,
-        "shortest": int(result.lifetime.min()),
-        "longest": int(result.lifetime.max()),
-        "lifetimes": result.lifetime[0].tolist(),
+        "shortest": int(lifetimes.min()),
+        "longest": int(lifetimes.max()),
+        "lifetimes": lifetimes.tolist(),
         "cause": most_common_cause(result.cause[0]),
-        "first_device": device_number(share),
+        "first_device": most_common_first_device(share),
         "first_share": float(share.max()),
     }
-
-
-_BASELINES = ("oldest-first", "earliest-deadline")
-"""Heuristics that a policy is shown beside."""

@@ -1,4 +1,4 @@
-"""The population that a study describes: its agents, their scenarios and their draws."""
+"""Make the population that a study describes: its agents, their scenarios and their volume draws."""
 
 import itertools
 import math
@@ -21,7 +21,7 @@ from uavmec_jax.env.scenario import Scenario
 from uavmec_jax.scenarios.distribution import make_distribution
 from uavmec_jax.scenarios.seeds import Stream, identity_keys, layout_for_seed
 from uavmec_jax.studies.axes import TRAFFIC_WEIGHTS
-from uavmec_jax.studies.places import onto_places
+from uavmec_jax.studies.places import move_to_places
 from uavmec_jax.studies.schema import Study
 
 AgentId = dict[str, Any]
@@ -35,13 +35,13 @@ def seeds_of(study: Study) -> list[int]:
 
 
 def cell_axes(study: Study) -> list[str]:
-    """Return the axes that make a cell: all but the seeds, ``powered`` and ``connected`` (or ``scenarios``) first."""
+    """Return the axes of a cell, which are all but the seeds; ``powered`` and ``connected``, or ``scenarios``, come first."""
     others = [name for name in study.axes if name not in ("powered", "connected", "cells", "seeds")]
     return [*(("scenarios",) if study.scenarios else ("powered", "connected")), *others]
 
 
 def split_by_algorithm(study: Study) -> list[Study]:
-    """Split a study into studies of one algorithm each, in the order in which they are run."""
+    """Split a study into studies of one algorithm each, in the order in which they run."""
     if "algorithm" not in study.axes:
         return [study]
     axes = {name: values for name, values in study.axes.items() if name != "algorithm"}
@@ -49,16 +49,17 @@ def split_by_algorithm(study: Study) -> list[Study]:
 
 
 def make_agent_ids(study: Study) -> list[AgentId]:
-    """Return the identities of all agents: algorithms outermost, then seeds, so that early shards hold whole grids.
+    """Return the identities of all agents.
 
-    A reward without ``log A`` and ``log O`` is the same under every guard; it occurs once, under the first.
+    Algorithms are outermost, then come the seeds, so that the first shards hold whole grids. A reward without ``log A`` and
+    ``log O`` is the same under every guard; it occurs once, under the first.
     """
     if "algorithm" in study.axes:
         order = ["seed", *cell_axes(study)]
         agent_ids = [
-            agent_id | {"algorithm": own.algorithm}
-            for own in split_by_algorithm(study)
-            for agent_id in make_agent_ids(own)
+            agent_id | {"algorithm": part.algorithm}
+            for part in split_by_algorithm(study)
+            for agent_id in make_agent_ids(part)
         ]
         return [{name: agent_id[name] for name in order} for agent_id in agent_ids]
     others = [name for name in cell_axes(study) if name in study.axes and name not in ("powered", "connected")]
@@ -71,7 +72,7 @@ def make_agent_ids(study: Study) -> list[AgentId]:
 
 
 def _cells(study: Study) -> list[AgentId]:
-    """Counts of powered and connected devices; or that scenarios are drawn."""
+    """Return the cells by their numbers of powered and connected devices; one cell if scenarios are drawn."""
     if study.scenarios is not None:
         return [{"scenarios": "drawn"}]
     pairs = study.axes.get("cells") or itertools.product(study.axes["powered"], study.axes["connected"])
@@ -79,14 +80,14 @@ def _cells(study: Study) -> list[AgentId]:
 
 
 def _repeats_earlier_guard(study: Study, agent_id: AgentId) -> bool:
-    """Whether an agent is the same as one under the first guard."""
+    """Return whether an agent is the same as one under the study's first guard."""
     if "guard" not in study.axes or agent_id["guard"] == study.axes["guard"][0]:
         return False
     return not needs_guard(agent_id.get("reward", study.reward))
 
 
 def n_agents(study: Study) -> int:
-    """Return the size of the population without making it."""
+    """Return the number of agents without making them."""
     others = [values for name, values in study.axes.items() if name not in ("seeds", "reward", "guard")]
     rewards, guards = study.axes.get("reward", [study.reward]), study.axes.get("guard", [study.guard])
     pairs = sum(len(guards) if needs_guard(reward) else 1 for reward in rewards)
@@ -95,7 +96,7 @@ def n_agents(study: Study) -> int:
 
 
 def make_algorithm(study: Study) -> Algorithm | None:
-    """Return the algorithm of a study of one, with its static settings; ``None`` if nothing is trained."""
+    """Return the algorithm of a study of one algorithm, or ``None`` if the study trains nothing."""
     if study.algorithm == "none":
         return None
     limits = study.axes.get("data_age_limit_slots", [study.params.data_age_limit_slots])
@@ -108,28 +109,30 @@ def make_algorithm(study: Study) -> Algorithm | None:
 
 
 def make_agents(study: Study, reward: Reward | None = None, agent_ids: list[AgentId] | None = None) -> Agent:
-    """Make agents of a study of one algorithm, leaves ``[A, ...]``; by default all, in the order of their identities.
+    """Make the agents of a study, leaves ``[A, ...]``.
 
-    What is random about an agent depends on its seed and its counts of devices alone: layouts on the seed (the cells of
-    one seed are the same devices with less and less power and communication), exploration and weights on all three.
-    Hyperparameters, rewards and algorithms are thus compared on equal ground.
+    The randomness of an agent depends on its seed and its numbers of powered and connected devices alone: the layout on the
+    seed (the cells of a seed have the same devices, fewer of them with power or communication), exploration and initial
+    weights on all three. Hyperparameters, rewards and algorithms are thus compared with common random numbers.
 
     Args:
-        study: of one algorithm, or of none.
+        study: a study of one algorithm, or one that trains nothing.
         reward: replaces the study's reward, for all agents.
-        agent_ids: some of the study's identities.
+        agent_ids: identities of the agents; by default all of the study, in the order of :func:`make_agent_ids`.
     """
     agent_ids = make_agent_ids(study) if agent_ids is None else agent_ids
     seeds, powered, connected = (_column(agent_ids, name) for name in ("seed", "powered", "connected"))
     params = Params(**{name: _stack(agent_ids, name, value) for name, value in study.params.model_dump().items()})
-    rewards = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(_reward_of(study, own, reward) for own in agent_ids))
+    rewards = jax.tree.map(
+        lambda *leaves: jnp.stack(leaves), *(_reward_of(study, agent_id, reward) for agent_id in agent_ids)
+    )
     scenario: Scenario | ScenarioDistribution
     if study.scenarios is None:
-        layout = onto_places(_layouts_for_seeds(seeds, params, powered, connected), agent_ids, study)
+        layout = move_to_places(_layouts_for_seeds(seeds, params, powered, connected), agent_ids, study)
         scenario = Scenario(params=params, layout=layout, reward=rewards)
     else:
         scenario = make_distribution(study.scenarios, params, rewards, len(agent_ids))
-    algorithm = "dqn" if study.algorithm == "none" else study.algorithm
+    algorithm = "dqn" if study.algorithm == "none" else study.algorithm  # hyperparameters without effect if "none"
     registered, settings = ALGORITHMS[algorithm], getattr(study, algorithm)
     return Agent(
         key=identity_keys(Stream.TRAINING, seeds, powered, connected),
@@ -141,16 +144,16 @@ def make_agents(study: Study, reward: Reward | None = None, agent_ids: list[Agen
 
 
 def _stack(agent_ids: list[AgentId], name: str, default: Any) -> Any:
-    """A setting of all agents: leaves ``[A]``, or what is static."""
+    """Return the values of a setting for all agents: leaves ``[A]``; a static setting as it is."""
     if isinstance(default, tuple):
-        return tuple(jnp.full(len(agent_ids), part, jnp.float32) for part in default)
+        return tuple(jnp.full(len(agent_ids), number, jnp.float32) for number in default)
     if name == "n_devices":
         return default
-    return jnp.asarray([own.get(name, default) for own in agent_ids], leaf_dtype(default))
+    return jnp.asarray([agent_id.get(name, default) for agent_id in agent_ids], leaf_dtype(default))
 
 
 def _reward_of(study: Study, agent_id: AgentId, reward: Reward | None) -> Reward:
-    """The reward of one agent: the given one or the study's, with its traffic weights."""
+    """Return the reward of one agent, the given one or the study's, with the agent's traffic weights."""
     if reward is None:
         reward = make_reward(agent_id.get("reward", study.reward), agent_id.get("guard", study.guard))
     traffic = {name: jnp.float32(agent_id.get(name, getattr(study, name))) for name in TRAFFIC_WEIGHTS}
@@ -161,12 +164,15 @@ _layouts_for_seeds = jax.jit(jax.vmap(layout_for_seed))
 
 
 def validation_keys(study: Study, agent_ids: list[AgentId] | None = None) -> Key[Array, "A D"]:
-    """Return ``[A, validation_draws]`` volume draws for the validations during training; by default of all agents."""
+    """Return the volume draws of each agent's validations, ``validation_draws`` of them; by default for all agents."""
     return _draw_keys(study, Stream.VALIDATION, study.evaluation.validation_draws, agent_ids)
 
 
-def evaluation_keys(study: Study, agent_ids: list[AgentId] | None = None) -> Key[Array, "A D"]:
-    """Return ``[A, draws + 1]`` volume draws for the tables; the last one is the fixed draw, the same for every agent."""
+def evaluation_keys(study: Study, agent_ids: list[AgentId] | None = None) -> Key[Array, "A E"]:
+    """Return the volume draws of each agent's evaluation; by default for all agents.
+
+    They are the study's ``draws`` held-out draws, followed by the fixed draw, which is the same for every agent.
+    """
     held_out = _draw_keys(study, Stream.HELD_OUT, study.evaluation.draws, agent_ids)
     fixed = jnp.broadcast_to(jax.random.key(Stream.FIXED), (held_out.shape[0], 1))
     return jnp.concatenate([held_out, fixed], axis=1)
@@ -174,7 +180,7 @@ def evaluation_keys(study: Study, agent_ids: list[AgentId] | None = None) -> Key
 
 def _draw_keys(study: Study, stream: Stream, draws: int, agent_ids: list[AgentId] | None) -> Key[Array, "A D"]:
     agent_ids = make_agent_ids(study) if agent_ids is None else agent_ids
-    if study.scenarios is not None:  # all agents are evaluated in the same scenarios
+    if study.scenarios is not None:  # all agents are evaluated on the same drawn scenarios
         agent_ids = [{"seed": 0}] * len(agent_ids)
     keys = identity_keys(stream, *(_column(agent_ids, name) for name in ("seed", "powered", "connected")))
     return _split(keys, draws)
@@ -186,5 +192,5 @@ def _split(keys: Key[Array, " A"], n: int) -> Key[Array, "A D"]:
 
 
 def _column(agent_ids: list[AgentId], name: str) -> Int[np.ndarray, " A"]:
-    """One number of every identity; 0 where it has none: drawn scenarios have no counts of devices."""
+    """Return one number of every identity; 0 if it has none, like the device counts of drawn scenarios."""
     return np.array([agent_id.get(name, 0) for agent_id in agent_ids], np.int32)

@@ -1,4 +1,4 @@
-"""What a run leaves: files that are read back without pickle, each written whole or not at all."""
+"""Results of a run: the tidy table, curves, evaluation and weights, and their files."""
 
 import hashlib
 import json
@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from flax import traverse_util
+from jaxtyping import Float
 
 from uavmec_jax.files.writing import write_arrays, write_text
 from uavmec_jax.scenarios.policy_files import WEIGHTS, PolicyCollection, write_policies
-from uavmec_jax.studies.evaluation import device_number
+from uavmec_jax.studies.evaluation_result import most_common_first_device
 from uavmec_jax.studies.population import cell_axes
 from uavmec_jax.studies.schema import PLANNERS, Study
 from uavmec_jax.studies.shard_result import ShardResult
@@ -22,25 +23,25 @@ from uavmec_jax.studies.statistics import mean_interval
 from uavmec_jax.studies.study import study_toml
 
 SCHEMA = 3
-"""Version of the run folder."""
+"""Version of the files of a run."""
 
 STUDY, RUN, AGENTS, CURVES, EVALUATION = "study.toml", "run.json", "agents.csv", "curves.npz", "evaluation.npz"
 
 
 @dataclass
 class Results:
-    """One run, whole or as far as it got.
+    """Results of a run, which may not be complete yet.
 
     Attributes:
         study: the resolved study.
-        run: what ``run.json`` holds: versions, hardware, command, seeds, times, speed.
+        run: contents of ``run.json``: versions, hardware, command, seeds, times, speed.
         agents: tidy table, one row per finished agent.
-        curves: per algorithm, of its agents: ``chunk_steps [C]``, ``episode_length [A, C]``, ``validation_steps [L]``,
-            ``validation [A, L]``.
-        evaluation: per policy ``<name>/lifetime [A, D + 1]``, ``/cause``, ``/first_failure [A, D + 1, n]``; of the
-            planners ``[A, P]`` and ``[A, P, n]``, the bound has lifetimes only.
-        weights: ``<algorithm>/best/...`` and ``<algorithm>/last/...``, leaves ``[A, ...]`` of its agents (empty when
-            read back by :func:`load_results`).
+        curves: per algorithm, of its agents: ``chunk_steps [C]``, ``episode_length [A, C]``, ``validation_steps [V]``,
+            ``validation [A, V]``.
+        evaluation: per policy ``<name>/lifetime [A, E]``, ``/cause [A, E]``, ``/first_failure [A, E, n]``, the fixed draw
+            last; per planner the same with ``P`` held-out draws in place of ``E``, of the bound the lifetimes only.
+        weights: ``<algorithm>/best/...`` and ``<algorithm>/last/...``, leaves ``[A, ...]`` of its agents; empty when
+            read back by :func:`load_results`.
     """
 
     study: Study
@@ -52,37 +53,32 @@ class Results:
 
     @property
     def policies(self) -> list[str]:
-        """Policies in the table, as in its column names."""
+        """Names of the policies in the table, as in its columns."""
         return [name.removesuffix("_lifetime") for name in self.agents.columns if name.endswith("_lifetime")]
 
     @property
     def shown(self) -> str:
-        """The policy that the tables are about: the best weights, or, where nothing was trained, the best heuristic."""
+        """Policy that tables show: the best weights; if nothing was trained, earliest-deadline or another heuristic."""
         preferred = ("best", "earliest_deadline", *self.policies, *PLANNERS)
         return next((name for name in preferred if f"{name}_first_device" in self.agents), "bound")
 
     @property
     def gaps(self) -> list[tuple[str, str]]:
-        """Pairs ``(upper, lower)`` of neighbours on the way from the shown policy to the upper bound."""
+        """Pairs ``(upper, lower)`` of neighbours in the order: shown policy, planners, upper bound."""
         ladder = [name for name in (self.shown, *PLANNERS) if f"{name}_planned" in self.agents]
         return list(zip(ladder[1:], ladder, strict=False))
 
-    @property
-    def _over_oldest(self) -> list[str]:
-        """Learned policies to be held against oldest-first, layout by layout."""
-        return [name for name in ("best", "last") if {name, "oldest_first"} <= set(self.policies)]
-
     @classmethod
     def of(cls, study: Study, label: Mapping[str, Any], shards: Iterable[ShardResult], agents: int) -> "Results":
-        """Put finished shards together, in the order of the plan.
+        """Combine the results of finished shards.
 
         Args:
             study: the resolved study.
-            label: of the run.
-            shards: those that are finished.
-            agents: how many there are when all are finished.
+            label: facts about the run, for ``run.json``.
+            shards: results of the finished shards, in the order of the run plan.
+            agents: number of agents in the whole study.
         """
-        made = cls(study, dict(label))
+        results = cls(study, dict(label))
         seconds: dict[str, float] = {}
         rows: list[pd.DataFrame] = []
         curves: dict[str, list[Mapping]] = {}
@@ -97,14 +93,14 @@ class Results:
             steps += shard.steps
             for activity, spent in shard.seconds.items():
                 seconds[activity] = seconds.get(activity, 0.0) + spent
-        made.agents = pd.concat(rows, ignore_index=True) if rows else pd.DataFrame()
-        made.curves = {name: _joined(own) for name, own in curves.items()}
-        made.evaluation, made.weights = _joined(evaluation), _joined(weights)
-        made._measure(agents, steps, seconds)
-        return made
+        results.agents = pd.concat(rows, ignore_index=True) if rows else pd.DataFrame()
+        results.curves = {name: _concatenate(pieces) for name, pieces in curves.items()}
+        results.evaluation, results.weights = _concatenate(evaluation), _concatenate(weights)
+        results._add_totals(agents, steps, seconds)
+        return results
 
-    def _measure(self, agents: int, steps: int, seconds: dict[str, float]) -> None:
-        """Add to the label what the finished shards took: seconds of all workers together, but for the wall time."""
+    def _add_totals(self, agents: int, steps: int, seconds: dict[str, float]) -> None:
+        """Add totals over the finished shards to ``run``; seconds are sums over all workers, except for the wall time."""
         seconds = seconds | {"wall": seconds.get("wall", 0.0) / self.run.get("workers", 1)}
         self.run |= {
             "complete": len(self.agents) == agents,
@@ -121,73 +117,80 @@ class Results:
             }
 
     def cells(self) -> pd.DataFrame:
-        """One row per cell: means and intervals over the seeds, paired differences to oldest-first, who fails first."""
-        rows = []
-        for cell, group in self.agents.groupby(cell_axes(self.study), sort=False):
-            row: dict[str, Any] = dict(zip(cell_axes(self.study), cell, strict=True)) | {"seeds": len(group)}
-            for policy in self.policies:
-                mean, low, high = mean_interval(group[f"{policy}_lifetime"].to_numpy())
-                row |= {policy: mean, f"{policy}_low": low, f"{policy}_high": high}
-                row[f"{policy}_max"] = float(group[f"{policy}_lifetime"].max())
-                row[f"{policy}_fixed"] = float(group[f"{policy}_lifetime_fixed"].mean())
-                share = self.first_failures(policy)[group.index].mean(axis=0)
-                row |= _first_to_fail(policy, share)
-            for policy in self._over_oldest:
-                paired = (group[f"{policy}_lifetime"] - group["oldest_first_lifetime"]).to_numpy()
-                names = (f"{policy}_over_oldest", f"{policy}_over_oldest_low", f"{policy}_over_oldest_high")
-                row |= dict(zip(names, mean_interval(paired), strict=True))
-            for name in group.columns[group.columns.str.endswith("_planned")]:
-                row[name] = float(group[name].mean())
-            for planner in (name for name in PLANNERS if f"{name}/first_failure" in self.evaluation):
-                share = self.evaluation[f"{planner}/first_failure"][group.index].mean(axis=(0, 1))
-                row |= _first_to_fail(planner, share)
-            for upper, lower in self.gaps:
-                paired = (group[f"{upper}_planned"] - group[f"{lower}_planned"]).to_numpy()
-                names = (f"{upper}_over_{lower}", f"{upper}_over_{lower}_low", f"{upper}_over_{lower}_high")
-                row |= dict(zip(names, mean_interval(paired), strict=True))
-            rows.append(row)
-        return pd.DataFrame(rows)
+        """Return one row per cell: means and intervals over seeds, paired differences, and the device that fails first."""
+        axes = cell_axes(self.study)
+        return pd.DataFrame(
+            dict(zip(axes, cell, strict=True)) | {"seeds": len(group)} | self._cell(group)
+            for cell, group in self.agents.groupby(axes, sort=False)
+        )
+
+    def _cell(self, agents: pd.DataFrame) -> dict[str, Any]:
+        """Return the row of one cell without its axes."""
+        row: dict[str, Any] = {}
+        for policy in self.policies:
+            lifetimes = agents[f"{policy}_lifetime"]
+            row |= _interval_columns(policy, lifetimes)
+            row[f"{policy}_max"] = float(lifetimes.max())
+            row[f"{policy}_fixed"] = float(agents[f"{policy}_lifetime_fixed"].mean())
+            row |= _first_failure_columns(policy, self.first_failures(policy)[agents.index].mean(axis=0))
+        for policy in (name for name in ("best", "last") if {name, "oldest_first"} <= set(self.policies)):
+            difference = agents[f"{policy}_lifetime"] - agents["oldest_first_lifetime"]
+            row |= _interval_columns(f"{policy}_over_oldest", difference)
+        for name in agents.columns[agents.columns.str.endswith("_planned")]:
+            row[name] = float(agents[name].mean())
+        for planner in (name for name in PLANNERS if f"{name}/first_failure" in self.evaluation):
+            share = self.evaluation[f"{planner}/first_failure"][agents.index].mean(axis=(0, 1))
+            row |= _first_failure_columns(planner, share)
+        for upper, lower in self.gaps:
+            difference = agents[f"{upper}_planned"] - agents[f"{lower}_planned"]
+            row |= _interval_columns(f"{upper}_over_{lower}", difference)
+        return row
 
     def curve_table(self) -> pd.DataFrame:
-        """Tidy: the agent's axes, ``steps``, ``curve`` (``episode_length`` or ``validation``), ``value``."""
+        """Return all curves as a tidy table: the agent's axes, ``steps``, ``curve`` and ``value``.
+
+        ``curve`` is ``episode_length`` or ``validation``.
+        """
         tables = []
         for name, curves in self.curves.items():
-            who = self._who(self.agents["algorithm"] == name if "algorithm" in self.agents else slice(None))
-            for curve, steps in (("episode_length", "chunk_steps"), ("validation", "validation_steps")):
-                n = len(curves[steps])
-                table = who.loc[who.index.repeat(n)].reset_index(drop=True)
-                tables.append(
-                    table.assign(steps=np.tile(curves[steps], len(who)), curve=curve, value=curves[curve].ravel())
-                )
+            agents = self._agent_axes(self.agents["algorithm"] == name if "algorithm" in self.agents else slice(None))
+            for curve, x in (("episode_length", "chunk_steps"), ("validation", "validation_steps")):
+                table = _repeat_rows(agents, len(curves[x]))
+                steps = np.tile(curves[x], len(agents))
+                tables.append(table.assign(steps=steps, curve=curve, value=curves[curve].ravel()))
         return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
     def episode_table(self) -> pd.DataFrame:
-        """Tidy: the agent's axes, ``policy``, ``draw``, whether it is the ``fixed`` one, ``lifetime`` in slots."""
-        who, tables = self._who(slice(None)), []
-        for name, lives in self.evaluation.items():
-            policy, _, what = name.partition("/")
-            if what != "lifetime":
+        """Return all episodes as a tidy table: the agent's axes, ``policy``, ``draw``, ``fixed`` and ``lifetime`` (slots).
+
+        ``fixed`` says whether the draw is the one that is the same for every agent.
+        """
+        agents, tables = self._agent_axes(slice(None)), []
+        for name, lifetimes in self.evaluation.items():
+            policy, _, field_name = name.partition("/")
+            if field_name != "lifetime":
                 continue
-            draw = np.tile(np.arange(lives.shape[1]), len(who))
-            table = who.loc[who.index.repeat(lives.shape[1])].reset_index(drop=True)
-            fixed = (draw == lives.shape[1] - 1) & (policy not in PLANNERS)
-            tables.append(table.assign(policy=policy, draw=draw, fixed=fixed, lifetime=lives.ravel()))
+            draws = lifetimes.shape[1]
+            draw = np.tile(np.arange(draws), len(agents))
+            fixed = (draw == draws - 1) & (policy not in PLANNERS)
+            table = _repeat_rows(agents, draws)
+            tables.append(table.assign(policy=policy, draw=draw, fixed=fixed, lifetime=lifetimes.ravel()))
         return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
-    def _who(self, which: Any) -> pd.DataFrame:
-        """The axes of some agents."""
+    def _agent_axes(self, which: Any) -> pd.DataFrame:
+        """Return the values of some agents on all axes."""
         return self.agents.loc[which, ["seed", *cell_axes(self.study)]].reset_index(drop=True)
 
-    def first_failures(self, policy: str) -> np.ndarray:
-        """``[A, n]`` how often each device of each agent's layout is the first to fail, over the held-out draws.
+    def first_failures(self, policy: str) -> Float[np.ndarray, "A n"]:
+        """Return each agent's share of held-out episodes in which each device is the first to fail.
 
-        A planner played the first few of them; a policy all, and the fixed draw behind them.
+        A planner's episodes are its first few held-out draws; a policy's are all of them, followed by the fixed draw.
         """
         episodes = self.evaluation[f"{policy}/first_failure"]
         return np.asarray((episodes if policy in PLANNERS else episodes[:, :-1]).mean(axis=1))
 
     def save(self, directory: Path) -> None:
-        """Write every file of the run into ``directory``, each atomically; ``run.json``, with their SHA-256, last."""
+        """Write all files into a folder, each atomically; ``run.json``, with the SHA-256 of the others, comes last."""
         directory.mkdir(parents=True, exist_ok=True)
         write_text(directory / STUDY, study_toml(self.study))
         if len(self.agents):
@@ -196,7 +199,7 @@ class Results:
             (CURVES, traverse_util.flatten_dict(self.curves, sep="/")),
             (EVALUATION, self.evaluation),
         ):
-            if arrays:  # nothing was trained: no curves, no weights
+            if arrays:  # a study that trains nothing has no curves and no weights
                 write_arrays(directory / name, arrays)
         if self.weights:
             write_policies(directory / WEIGHTS, self._collection())
@@ -205,31 +208,41 @@ class Results:
         write_text(directory / RUN, json.dumps(self.run | {"sha256": digests}, indent=1) + "\n")
 
     def _collection(self) -> PolicyCollection:
-        """The weights with all that is needed to make policies of them."""
+        """Return the weights with all that is needed to make policies of them."""
         agents: dict[str, list[dict[str, Any]]] = {name: [] for name in self.study.algorithms}
         axes = self.agents[["seed", *cell_axes(self.study)]]
         for row in json.loads(axes.to_json(orient="records", double_precision=15)):
             agents[row.get("algorithm", self.study.algorithm)].append(row)
-        finished = {name: own for name, own in agents.items() if own}
+        finished = {name: agent_ids for name, agent_ids in agents.items() if agent_ids}
         return policy_collection(self.study, finished, self.weights)
 
 
-def _joined(pieces: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
-    """Arrays with an axis of agents, one after the other; the steps of curves are shared by all."""
-    found: dict[str, list[np.ndarray]] = {}
+def _concatenate(pieces: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
+    """Concatenate arrays along the axis of agents; the steps of curves, which all agents share, are taken once."""
+    by_name: dict[str, list[np.ndarray]] = {}
     for piece in pieces:
         for name, values in piece.items():
-            found.setdefault(name, []).append(np.asarray(values))
-    return {name: own[0] if name.endswith("_steps") else np.concatenate(own) for name, own in found.items()}
+            by_name.setdefault(name, []).append(np.asarray(values))
+    return {name: arrays[0] if name.endswith("_steps") else np.concatenate(arrays) for name, arrays in by_name.items()}
 
 
-def _first_to_fail(policy: str, share: np.ndarray) -> dict[str, Any]:
-    """The device (from 1, 0 for none) that is first most often, of ``share [n]``."""
-    return {f"{policy}_first_device": device_number(share), f"{policy}_first_share": float(share.max())}
+def _repeat_rows(table: pd.DataFrame, times: int) -> pd.DataFrame:
+    """Repeat every row of a table."""
+    return table.loc[table.index.repeat(times)].reset_index(drop=True)
+
+
+def _interval_columns(name: str, values: pd.Series) -> dict[str, float]:
+    """Return a mean with its 95 % interval as columns."""
+    return dict(zip((name, f"{name}_low", f"{name}_high"), mean_interval(values.to_numpy()), strict=True))
+
+
+def _first_failure_columns(policy: str, share: Float[np.ndarray, " n"]) -> dict[str, Any]:
+    """Return the device that fails first most often, and its share of first failures, as columns."""
+    return {f"{policy}_first_device": most_common_first_device(share), f"{policy}_first_share": float(share.max())}
 
 
 def _drawn(study: Study) -> dict[str, Any]:
-    """What scenarios were drawn from, as plain data; infinite numbers, which JSON has no word for, are left out."""
+    """Return the settings that scenarios are drawn from, for JSON; infinite numbers, which it lacks, are left out."""
     if study.scenarios is None:
         return {}
     params = {name: value for name, value in study.params.model_dump().items() if value != math.inf}
@@ -239,12 +252,18 @@ def _drawn(study: Study) -> dict[str, Any]:
 def policy_collection(
     study: Study, agents: Mapping[str, list[dict[str, Any]]], weights: Mapping[str, Any]
 ) -> PolicyCollection:
-    """Agents of a study as a collection of policies, ``weights`` by algorithm and kind: nested, or flat with ``/``."""
+    """Make a collection of the policies of a study's agents.
+
+    Args:
+        study: the study.
+        agents: algorithm -> identities of the agents.
+        weights: weights by algorithm and ``best`` or ``last``, nested or flattened with ``/``.
+    """
     place = {"place": study.place} if study.place else {}
     return PolicyCollection(
         settings={name: getattr(study, name).model_dump(mode="json") for name in agents},
         n_devices=study.params.n_devices,
-        agents={name: [dict(who) | place for who in own] for name, own in agents.items()},
+        agents={name: [dict(agent_id) | place for agent_id in agent_ids] for name, agent_ids in agents.items()},
         weights=traverse_util.flatten_dict(dict(weights), sep="/"),
         drawn=_drawn(study),
     )

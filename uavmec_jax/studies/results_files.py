@@ -1,4 +1,4 @@
-"""Results read back from the files of a finished run."""
+"""Read results back from the files of a finished run."""
 
 import hashlib
 import json
@@ -17,10 +17,10 @@ from uavmec_jax.studies.study import load_study
 
 
 def read_results(directory: Path) -> Results:
-    """Read the results of a finished run (all but its weights, see :func:`load_weights`).
+    """Read the results of a finished run, without its weights (see :func:`load_weights`).
 
     Raises:
-        StudyError: the folder holds none, a file of it is damaged, or it was written by another version.
+        StudyError: the folder holds no finished run, one of its files is damaged, or another version wrote it.
     """
     run = _read_run(directory)
     _check_digests(directory, run)
@@ -34,7 +34,7 @@ def read_results(directory: Path) -> Results:
 
 
 def _read_run(directory: Path) -> dict[str, Any]:
-    """The contents of ``run.json``."""
+    """Read ``run.json``."""
     path = directory / RUN
     if not path.is_file():
         raise StudyError(f"{directory}: holds no run ({RUN} is missing)")
@@ -49,7 +49,7 @@ def _read_run(directory: Path) -> dict[str, Any]:
 
 
 def _check_digests(directory: Path, run: dict[str, Any]) -> None:
-    """Check that the files are those that the run wrote."""
+    """Check that the files are as the run wrote them."""
     for name, digest in run.get("sha256", {}).items():
         path = directory / name
         if path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() != digest:
@@ -57,7 +57,7 @@ def _check_digests(directory: Path, run: dict[str, Any]) -> None:
 
 
 def _read_table(path: Path) -> pd.DataFrame:
-    """The tidy table; lists of device numbers stay text, also where they are empty or one number."""
+    """Read the tidy table; lists of device numbers stay text, also if they are empty or have one number."""
     lists = {name: str for name in pd.read_csv(path, nrows=0).columns if name.endswith("_devices_fixed")}
     return pd.read_csv(path, dtype=lists, keep_default_na=False)
 
@@ -66,11 +66,11 @@ def load_weights(directory: str | Path, which: str = "best", algorithm: str | No
     """Load trained weights of a run as the networks take them, leaves ``[A, ...]`` in the order of ``agents.csv``.
 
     Args:
-        directory: of the run.
+        directory: folder of the run.
         which: ``"best"`` or ``"last"``.
-        algorithm: whose agents; by default the first algorithm of the run.
+        algorithm: name of the algorithm; by default the first one of the run.
 
     Raises:
-        PolicyError: there are none, or the file is damaged.
+        PolicyError: there are no such weights, or the file is damaged.
     """
     return read_policies(Path(directory) / WEIGHTS).weights_of(which, algorithm)

@@ -1,7 +1,7 @@
-"""Study files: what they may hold, and one clear line for whatever does not fit.
+"""The schema of study files.
 
-The numbers of Table 1 and the hyperparameters are declared once (:class:`Params`, :data:`ALGORITHMS`); the checks of a
-study file are made from those declarations.
+The numbers of Table 1 and the hyperparameters are declared once (:class:`Params`, :data:`ALGORITHMS`); their models here are
+made from those declarations.
 """
 
 from typing import Annotated, Any, Literal, get_args
@@ -21,7 +21,7 @@ from uavmec_jax.studies.axes import TRAFFIC_WEIGHTS, check_axes, check_reward
 
 
 def _algorithm_settings(name: str) -> Any:
-    """The checked settings of an algorithm, traced and static."""
+    """Make the model of an algorithm's settings, traced and static."""
     registered = ALGORITHMS[name]
     return model_from_dataclasses(
         f"{name.upper()}Settings", registered.hyper, registered.spec, leave_out=SCENARIO_SETTINGS
@@ -38,55 +38,55 @@ Heuristic: Any = Literal[tuple(HEURISTICS)]
 
 Planner = Literal["rollout", "beam", "bound"]
 PLANNERS: tuple[Planner, ...] = get_args(Planner)
-"""From what a UAV can do to the upper bound on what any policy can."""
+"""In the order of their lifetimes: without knowledge of the future, clairvoyant, and the upper bound on every policy."""
 
 
 class Evaluation(StrictModel):
     """How policies are evaluated."""
 
     draws: Annotated[int, Field(ge=1, le=10_000)] = 32
-    """Held-out volume draws per agent; one fixed draw, the same for every agent, is played too."""
+    """Held-out volume draws per agent; besides, there is one fixed draw, the same for every agent."""
     validate_every: Annotated[int, Field(ge=1)] = 10_000
     """Environment steps of one agent between validations of the greedy policy."""
     validation_draws: Annotated[int, Field(ge=1, le=1000)] = 16
     baselines: Annotated[tuple[Heuristic, ...], from_array] = tuple(HEURISTICS)
-    """Heuristics that play the same draws as the trained policies."""
+    """Heuristics that are evaluated on the same draws as the trained policies."""
     planners: Annotated[tuple[Planner, ...], from_array] = PLANNERS
-    """Planners and the bound, which say how far policies are from the best possible; see ``docs/planning.md``."""
+    """Planners and the bound, which show how far policies are from the optimum; see ``docs/planning.md``."""
     planner_draws: Annotated[int, Field(ge=1, le=10_000)] = 8
-    """The planners play this many of the held-out draws, from the first on (all of them if there are fewer)."""
+    """Number of held-out draws, from the first on, that planners are evaluated on (all of them if there are fewer)."""
     rollout_samples: Annotated[int, Field(ge=1, le=1000)] = ROLLOUT_SAMPLES
     beam_width: Annotated[int, Field(ge=1, le=100_000)] = BEAM_WIDTH
 
 
 class Study(StrictModel):
-    """One study: the product of its axes is the population."""
+    """A study; its population is the product of its axes."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=80)] = "study"
     description: str = ""
     algorithm: AlgorithmName = "dqn"
-    """``none`` trains nothing: heuristics and planners alone. Several algorithms are an axis."""
+    """``none`` trains nothing and evaluates heuristics and planners only. Several algorithms are an axis."""
     reward: str | dict[str, float] = DEFAULT_REWARD
     guard: Guard = "clamp"
     steps: Annotated[int, Field(ge=1, le=2_000_000_000)] = 1_000_000
     """Environment steps of one agent."""
     place: str = ""
-    """A place whose evacuation was simulated: one that ships with the package, or a file. Empty: random towns."""
+    """A place whose evacuation was simulated, by name or file; if empty, positions are random and traffic is unknown."""
     place_scale_m: Annotated[float, Field(gt=0)] | None = None
-    """Longer side that a place is scaled to (the paper's region: 800); by default distances are the real ones."""
+    """Length to which the longer side of a place is scaled (800 in the paper); by default distances are real."""
     traffic: Literal["static", "moving"] = "static"
-    """Devices' traffic weights: their mean over the evacuation, or those of the present window."""
+    """Whether a device's traffic weight is its mean over the evacuation, or that of the present window."""
     traffic_bonus: Annotated[float, Field(ge=0)] = 0.0
     """Added to the reward when a device is visited, times its traffic weight."""
     traffic_penalty: Annotated[float, Field(ge=0)] = 0.0
-    """Taken off the reward when a device is the first to fail, times its traffic weight."""
+    """Subtracted from the reward when a device is the first to fail, times its traffic weight."""
     slot_reward: Annotated[float, Field(ge=0)] = 0.0
-    """Added to the reward for every slot that counts."""
+    """Added to the reward for every slot that counts toward the lifetime."""
     scenarios: ScenarioSettings | None = None
-    """The distribution from which every episode draws a scenario, in place of the axes ``powered`` and ``connected``."""
+    """Distribution from which every episode draws a scenario; it replaces the axes ``powered`` and ``connected``."""
     axes: dict[str, Any]
     """``powered`` and ``connected``, or ``cells`` (pairs of the two); ``seeds`` (a number or a list); ``algorithm``,
-    ``reward``, ``guard``, ``place``, ``traffic_bonus``, ``traffic_penalty``, any traced setting."""
+    ``reward``, ``guard``, ``place``, ``traffic_bonus``, ``traffic_penalty``, or any traced setting."""
     dqn: DQNSettings = DQNSettings()
     ppo: PPOSettings = PPOSettings()
     a2c: A2CSettings = A2CSettings()
@@ -98,8 +98,8 @@ class Study(StrictModel):
         """Names of the algorithms that the study trains."""
         if self.algorithm == "none":
             return ()
-        named = self.axes.get("algorithm", [self.algorithm])
-        return tuple(name for name in ALGORITHMS if isinstance(named, list) and name in named)
+        names = self.axes.get("algorithm", [self.algorithm])
+        return tuple(name for name in ALGORITHMS if isinstance(names, list) and name in names)
 
     @pydantic.model_validator(mode="after")
     def _check(self) -> "Study":
@@ -117,12 +117,14 @@ class Study(StrictModel):
 
 
 def _check_drawn(study: Study) -> None:
-    """Check that drawn scenarios have an algorithm that can play them, and override nothing else."""
+    """Check that the algorithms can train on drawn scenarios, and that no other setting determines the scenario."""
     if study.scenarios is None:
         return
     check_scenarios(study.scenarios, study.params.n_devices)
     if "dqn" in study.algorithms:
-        raise ValueError("scenarios are given, and algorithm is 'dqn', which plays one scenario; take 'ppo' or 'a2c'")
+        raise ValueError(
+            "scenarios are given, and algorithm is 'dqn', which trains on one scenario; take 'ppo' or 'a2c'"
+        )
     for name in ("place", "traffic_bonus", "traffic_penalty"):
         if getattr(study, name) or name in study.axes:
             raise ValueError(f"{name} is given, and scenarios too, which draw their own; leave one of them out")
@@ -138,7 +140,7 @@ def _check_traffic(study: Study) -> None:
 
 
 def _check_algorithms(study: Study) -> None:
-    """Check that settings have an effect and fit together."""
+    """Check that only algorithms of the study have settings, and that the settings of each fit together."""
     for name in ALGORITHMS:
         if name in study.model_fields_set and name not in study.algorithms and study.algorithms:
             raise ValueError(f"{name} has settings, but the study trains {', '.join(study.algorithms)}; leave them out")

@@ -1,4 +1,4 @@
-"""What one finished shard leaves: rows, curves, evaluation and weights, in one checked file."""
+"""Results of one finished shard, in one checked file: rows, curves, evaluation and weights."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,19 +12,22 @@ from uavmec_jax.errors import StudyError
 from uavmec_jax.files.archives import read_checked, write_checked
 
 SHARD_SCHEMA = 1
-"""Version of a finished shard's file."""
+"""Version of the file format."""
+
+_NUMBERS = "biuf"
+"""Kinds of NumPy dtypes that are stored as they are; other columns are stored as text."""
 
 
 @dataclass(frozen=True)
 class ShardResult:
-    """A shard that is trained and judged.
+    """Results of a shard whose agents are trained and evaluated.
 
     Attributes:
-        algorithm: its name.
+        algorithm: name of the algorithm.
         rows: tidy table, one row per agent.
-        curves, evaluation, weights: see :class:`uavmec_jax.studies.results.Results`.
-        seconds: by activity.
-        steps: environment steps of all its agents.
+        curves, evaluation, weights: as in :class:`uavmec_jax.studies.results.Results`, of this shard alone.
+        seconds: time spent, by activity.
+        steps: environment steps of all agents together.
     """
 
     algorithm: str
@@ -36,10 +39,10 @@ class ShardResult:
     steps: int
 
     def write(self, path: Path) -> None:
-        """Into one checked file, whole or not at all."""
+        """Write the results into one checked file, atomically."""
         trees = {"curves": self.curves, "evaluation": self.evaluation, "weights": self.weights}
         columns = {
-            f"rows/{name}": column.to_numpy() if column.dtype.kind in "biuf" else column.to_numpy(dtype=str)
+            f"rows/{name}": column.to_numpy(dtype=None if column.dtype.kind in _NUMBERS else str)
             for name, column in self.rows.items()
         }
         arrays = columns | {
@@ -52,26 +55,27 @@ class ShardResult:
 
     @classmethod
     def read(cls, path: Path) -> "ShardResult":
-        """What :meth:`write` wrote.
+        """Read what :meth:`write` wrote.
 
         Raises:
-            StudyError: the file is not there, damaged, altered, something else or of another version.
+            StudyError: the file is missing, damaged, altered, of another kind or from another version.
         """
         facts, arrays = read_checked(path, SHARD_SCHEMA, "a finished shard", StudyError)
 
-        def of(kind: str) -> dict[str, Any]:
+        def arrays_of(kind: str) -> dict[str, np.ndarray]:
             return {name.removeprefix(f"{kind}/"): leaf for name, leaf in arrays.items() if name.startswith(f"{kind}/")}
 
-        found = of("rows")
+        columns = arrays_of("rows")
         rows = {
-            name: found[name] if found[name].dtype.kind in "biuf" else found[name].tolist() for name in facts["columns"]
+            name: columns[name] if columns[name].dtype.kind in _NUMBERS else columns[name].tolist()
+            for name in facts["columns"]
         }
         return cls(
             algorithm=facts["algorithm"],
             rows=pd.DataFrame(rows),
-            curves=of("curves"),
-            evaluation=of("evaluation"),
-            weights=traverse_util.unflatten_dict(of("weights"), sep="/"),
+            curves=arrays_of("curves"),
+            evaluation=arrays_of("evaluation"),
+            weights=traverse_util.unflatten_dict(arrays_of("weights"), sep="/"),
             seconds=facts["seconds"],
             steps=facts["steps"],
         )

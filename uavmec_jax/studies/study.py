@@ -1,4 +1,4 @@
-"""Study files: read, checked, changed and written."""
+"""Read, check, change and write study files."""
 
 from collections.abc import Mapping
 from importlib import resources
@@ -18,7 +18,7 @@ _LIBRARY = resources.files("uavmec_jax.studies") / "library"
 
 
 def shipped_studies() -> dict[str, Any]:
-    """Return the studies inside the package: name -> file."""
+    """Return the studies that ship with the package: name -> file."""
     return {Path(file.name).stem: file for file in _LIBRARY.iterdir() if file.name.endswith(".toml")}
 
 
@@ -30,7 +30,7 @@ def load_study(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
         overrides: dotted names to values, e.g. ``{"steps": 20000, "axes.seeds": 3, "dqn.gamma": 0.99}``.
 
     Raises:
-        StudyError: the file is missing, is not TOML, or holds something that does not fit; one line.
+        StudyError: the file is missing, is not TOML, or has a wrong setting; one line.
     """
     library = shipped_studies()
     if str(name_or_path) in library:
@@ -46,20 +46,25 @@ def load_study(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
 
 
 def parse_study(text: str, source: str, overrides: Mapping[str, Any] | None = None) -> Study:
-    """Check TOML text and make the :class:`Study`; ``source`` names it in messages.
+    """Make a :class:`Study` from the text of a study file.
+
+    Args:
+        text: TOML.
+        source: name of the file, for messages.
+        overrides: as in :func:`load_study`.
 
     Raises:
-        StudyError: as :func:`load_study`.
+        StudyError: the text is not TOML, or has a wrong setting; one line.
     """
     data = parse_toml(text, source, StudyError)
     for dotted, value in (overrides or {}).items():
         *parents, last = dotted.split(".")
-        place = data
+        table = data
         for parent in parents:
-            place = place.setdefault(parent, {})
-            if not isinstance(place, dict):
+            table = table.setdefault(parent, {})
+            if not isinstance(table, dict):
                 raise StudyError(f"{source}: {dotted} cannot be set: {parent} is not a table")
-        place[last] = value
+        table[last] = value
     data.setdefault("name", Path(source).stem)
     try:
         return Study.model_validate(data)
@@ -68,6 +73,6 @@ def parse_study(text: str, source: str, overrides: Mapping[str, Any] | None = No
 
 
 def study_toml(study: Study) -> str:
-    """Write a study, every setting resolved, as TOML that :func:`load_study` reads back to an equal study."""
-    silent = set(ALGORITHMS) - set(study.algorithms)
-    return tomli_w.dumps(study.model_dump(exclude=silent, exclude_none=True))
+    """Return the text of a study file with every setting resolved, from which an equal study is read back."""
+    unused = set(ALGORITHMS) - set(study.algorithms)
+    return tomli_w.dumps(study.model_dump(exclude=unused, exclude_none=True))
