@@ -15,9 +15,8 @@ import numpy as np
 from uavmec_jax.errors import StudyError, UserError
 from uavmec_jax.files.writing import write_arrays
 
-_READ_ERRORS = (OSError, ValueError, EOFError, AttributeError, NotImplementedError, zipfile.BadZipFile, zlib.error)
-"""Errors that zipfile, zlib and NumPy raise for damaged files and for files of another kind (an unknown compression is
-``NotImplementedError``, a bare array in place of an archive is ``AttributeError``)."""
+_READ_ERRORS = (OSError, ValueError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+"""Errors that zipfile, zlib and NumPy raise for damaged files and for files of another kind."""
 
 _HEADER = "header"
 """Name of the archive's member that holds the header as JSON."""
@@ -30,8 +29,8 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
         StudyError: the file is missing, damaged or of another kind.
     """
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
+        with _open_archive(path) as archive:
+            return {name: archive[name] for name in archive.files}
     except _READ_ERRORS as error:
         raise StudyError(f"{path}: cannot be read: {error}") from None
 
@@ -84,12 +83,23 @@ def open_checked(
         UserError: the file is missing, damaged, altered, of another kind or of another version; of the type ``error``.
     """
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+        with _open_archive(path) as archive:
             yield _check_header(path, archive, schema, kind, error), _Members(archive)
     except UserError:
         raise
     except _READ_ERRORS as problem:
         raise error(f"{path}: cannot be read: {problem}") from None
+
+
+@contextmanager
+def _open_archive(path: Path) -> Iterator[Any]:
+    """Open an ``.npz`` without pickle."""
+    with path.open("rb") as file:
+        archive = np.load(file, allow_pickle=False)
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            raise ValueError("it holds a single array")
+        with archive:
+            yield archive
 
 
 class _Members(Mapping[str, np.ndarray]):
@@ -125,7 +135,7 @@ def _check_header(path: Path, archive: Any, schema: int, kind: str, error: type[
     return header
 
 
-def _digest(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
+def _digest(header: Mapping[str, Any], arrays: Mapping[str, Any]) -> str:
     """Return the SHA-256 of a header and of the names, dtypes, shapes and bytes of the arrays."""
     digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(arrays):

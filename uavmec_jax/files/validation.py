@@ -114,6 +114,8 @@ def _split_location(location: list[Any], model: type[BaseModel], data: Any) -> t
 def _fields_at(model: Any, location: Sequence[Any]) -> dict[str, Any]:
     """Return the fields of the model at a location inside ``model``; empty if there is no model."""
     for part in location:
+        if isinstance(part, int):  # all tables of a list have the same model
+            continue
         fields = getattr(model, "model_fields", None)
         if fields is not None:
             model = fields[part].annotation if part in fields else None
