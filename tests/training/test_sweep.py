@@ -1,10 +1,11 @@
-"""Training from a script of one's own."""
+"""``um.train``: training from a script."""
 
 import jax
 import numpy as np
 import pytest
 
 import uavmec_jax as um
+from tests.populations import take
 
 
 @pytest.fixture(scope="module")
@@ -16,7 +17,7 @@ def scenarios():
 
 
 @pytest.mark.slow
-def test_a_sweep_of_ones_own(scenarios):
+def test_a_sweep_over_learning_rates(scenarios):
     rates = np.array([7e-4, 7e-4, 1e30], np.float32)
     trained = um.train(
         "a2c",
@@ -33,14 +34,13 @@ def test_a_sweep_of_ones_own(scenarios):
     assert (table["diverged_at"] >= 0).tolist() == [False, False, True]
     curves = trained.curve_table()
     assert curves.groupby("agent")["validation"].max().tolist() == table["best_validation"].tolist()
-    first = jax.tree.map(lambda leaf: leaf[0], scenarios)
-    world = (first.params, first.layout)
-    played = um.rollouts(trained.policy(0), *world, jax.random.split(jax.random.key(3), 4))
-    assert played.length.min() >= 5
+    first = take(scenarios, 0)
+    episodes = um.rollouts(trained.policy(0), first.params, first.layout, jax.random.split(jax.random.key(3), 4))
+    assert episodes.length.min() >= 5
 
 
 @pytest.mark.parametrize(
-    ("changes", "line"),
+    ("changes", "message"),
     [
         ({"algorithm": "dqnn"}, "algorithm is 'dqnn'; did you mean 'dqn'"),
         (
@@ -52,7 +52,12 @@ def test_a_sweep_of_ones_own(scenarios):
         ({"steps": 2 * 10**9, "settings": {"replay_capacity": 2 * 10**9}}, "steps is 2000000000: one agent needs"),
     ],
 )
-def test_what_cannot_be_trained_is_said(scenarios, changes, line):
-    wanted = {"algorithm": "dqn", "key": jax.random.key(0), "steps": 100} | changes
-    with pytest.raises(um.UserError, match=line):
-        um.train(wanted.pop("algorithm"), scenarios, **wanted)
+def test_bad_arguments_are_refused(scenarios, changes, message):
+    arguments = {"algorithm": "dqn", "key": jax.random.key(0), "steps": 100} | changes
+    with pytest.raises(um.UserError, match=message):
+        um.train(arguments.pop("algorithm"), scenarios, **arguments)
+
+
+def test_one_scenario_is_not_a_batch(scenarios):
+    with pytest.raises(AssertionError, match="rank"):
+        um.train("dqn", take(scenarios, 0), key=jax.random.key(0), steps=100)
