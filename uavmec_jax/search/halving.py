@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -129,9 +130,11 @@ class SuccessiveHalving:
             weights = jnp.repeat(jnp.stack([reward.weights for reward in rewards]), self.n_scenarios, axis=0)
             scenario = replace(agents.scenario, reward=replace(agents.scenario.reward, weights=weights))
             agents = replace(agents, scenario=scenario)
+        keys = validation_keys(study, agent_ids)
+        chex.assert_tree_shape_prefix((agents, keys), (len(agent_ids),))
         algorithm = make_algorithm(study)
         assert algorithm is not None
-        return agents, validation_keys(study, agent_ids), algorithm
+        return agents, keys, algorithm
 
     def _with_static(self, trial: Values) -> Study:
         """Return the study with a trial's static settings."""
