@@ -89,8 +89,8 @@ def ceiling(agents_per_device: int, seconds: float) -> float:
     weights = tuple(jax.random.normal(jax.random.key(i), (n, *shape)) * 0.1 for i, shape in enumerate(shapes))
     carry = (jnp.ones((n, 16, 24)), jnp.ones((n, 1, 24)), weights, tuple(w + 0 for w in weights))
     split = PartitionSpec("agents")
-    specs = {"in_specs": (split, PartitionSpec()), "out_specs": split, "check_vma": False}
-    run = jax.jit(jax.shard_map(all_agents, mesh=mesh, **specs))
+    in_specs = (split, PartitionSpec())
+    run = jax.jit(jax.shard_map(all_agents, mesh=mesh, in_specs=in_specs, out_specs=split, check_vma=False))
     carry = jax.block_until_ready(run(carry, 200))
     rates, deadline = [], time.perf_counter() + seconds
     while time.perf_counter() < deadline:

@@ -55,7 +55,7 @@ class FiveValueEnv:
 
     def observation_space(self, params: FiveValueParams) -> Any:
         """Return gymnax's ``Box`` from 0 to the data age limit + 1."""
-        from gymnax.environments import spaces  # gymnax is not a dependency; whoever asks for its spaces has it
+        from gymnax.environments import spaces  # not a dependency: only clients of gymnax call this
 
         max_age = params.scenario.params.data_age_limit_slots + 1.0
         return spaces.Box(0.0, max_age, self._env.observation_shape(params.scenario), jnp.float32)

@@ -30,7 +30,11 @@ def label_rewards(cells: pd.DataFrame) -> list[str]:
 
 def table6_tables(cells: pd.DataFrame) -> dict[str, Table]:
     """Return tables by title: one for each pair of counts of powered and connected devices, and one without training."""
-    guard = f"; logarithms guarded by {cells['guard'].iloc[0]} where nothing else is said" if "guard" in cells else ""
+    guard = (
+        f"; logarithms guarded by {cells['guard'].iloc[0]} unless the row names another guard"
+        if "guard" in cells
+        else ""
+    )
     content = f"best weights: mean over the seeds ± 95 %; maximum / the paper's maximum; last weights{guard}"
     pairs = dict.fromkeys(zip(cells.powered, cells.connected, strict=True))
     tables = {
