@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from tests.planning.exact import exact_tour
 from tests.planning.instances import SLOTS, small_instance, traced
 from tests.small_scenarios import three_devices
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import rollout, volume_table
 from uavmec_jax.planning.beam import beam_search, horizon
 from uavmec_jax.planning.bound import _refuted, upper_bound
-from uavmec_jax.planning.exact import exact_tour
 from uavmec_jax.planning.flight import Rounds
 from uavmec_jax.planning.heuristics import HEURISTICS
 from uavmec_jax.planning.parallel import beam_episodes, bound_scenarios, heuristic_episodes, rollout_planner_episodes

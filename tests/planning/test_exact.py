@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.planning.exact import exact_tour
 from tests.planning.instances import SLOTS, small_instance, traced
 from uavmec_jax.env.rollout import rollout, tour_policy
-from uavmec_jax.planning.exact import exact_tour
 
 pytestmark = pytest.mark.slow
 
@@ -38,4 +38,4 @@ def test_exact_is_the_best_of_every_tour(number):
 def test_too_large_is_said():
     params, layout, _, volumes = small_instance(5, devices=5)
     with pytest.raises(ValueError, match="more than 2 states"):
-        exact_tour(traced(params), layout, np.asarray(volumes), most_states=2)
+        exact_tour(traced(params), layout, np.asarray(volumes), max_states=2)

@@ -8,7 +8,6 @@ from .bound import upper_bound as upper_bound
 from .bound import upper_bounds as upper_bounds
 from .changes import WhatIf as WhatIf
 from .deadlines import earliest_deadline as earliest_deadline
-from .exact import exact_tour as exact_tour
 from .forecast import Forecast as Forecast
 from .forecast import make_forecast as make_forecast
 from .heuristics import HEURISTICS as HEURISTICS
