@@ -82,6 +82,14 @@ def test_a_flipped_bit_is_refused_or_without_effect(path):
     assert refused > len(content) // 31 // 2
 
 
+def test_an_archive_that_claims_to_be_encrypted_is_refused(path):
+    content = bytearray(path.read_bytes())
+    content[content.index(b"PK\x01\x02") + 8] |= 1
+    path.write_bytes(content)
+    with pytest.raises(TrafficError, match=r"x\.npz: cannot be read: it is encrypted"):
+        read(path)
+
+
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.9, 0.999])
 def test_a_truncated_archive_is_refused(path, share):
     content = path.read_bytes()

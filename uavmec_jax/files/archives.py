@@ -98,6 +98,8 @@ def _open_archive(path: Path) -> Iterator[Any]:
         archive = np.load(file, allow_pickle=False)
         if not isinstance(archive, np.lib.npyio.NpzFile):
             raise ValueError("it holds a single array")
+        if any(member.flag_bits & 1 for member in archive.zip.infolist()):  # zipfile would ask for a password
+            raise ValueError("it is encrypted")
         with archive:
             yield archive
 
