@@ -124,7 +124,7 @@ class BatteryDemand:
 
 
 def battery_demand(
-    layout: Layout, costs: SlotCosts, first: Int[ArrayLike, ""], last: Int[ArrayLike, ""]
+    layout: Layout, costs: SlotCosts, first: Int[Array, ""] | int, last: Int[Array, ""] | int
 ) -> BatteryDemand:
     """Return the demand of the slots ``first .. last - 1``, in which the services with the largest savings come first."""
     slot = jnp.arange(costs.work.shape[0])[:, None]
