@@ -51,7 +51,7 @@ def exact_tour(params: Params, layout: Layout, volumes: Num[np.ndarray, "H n"], 
         states = jax.tree.map(lambda leaf, chosen=chosen: leaf[chosen], after)
         tours = tours[chosen // n]
         tours[:, slot] = chosen % n
-    return Tour(lifetime=np.int32(lifetime), actions=best_tour, bound=np.int32(lifetime))
+    return Tour(lifetime=jnp.int32(lifetime), actions=jnp.asarray(best_tour), bound=jnp.int32(lifetime))
 
 
 def _visit_all(params: Params, layout: Layout, states: State, volumes: Num[np.ndarray, " n"]) -> tuple[State, Outcome]:
