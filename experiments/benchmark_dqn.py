@@ -34,7 +34,7 @@ def train_speed(n_agents: int, seconds: float) -> dict:
         lambda rows: rows.at[:, 1 : FILLED + 1].set(jnp.tile(rows[:, 1 : 4 * played + 1], (1, repeats, 1))),
         donate_argnums=0,
     )
-    prepare = lambda state: state.replace(rows=fill(state.rows))  # noqa: E731
+    prepare = lambda state: state.replace(buffer_state=fill(state.buffer_state))  # noqa: E731
     return {"agents": n_agents} | training_speed(study, seconds, warm_up=played, start=FILLED // 4, prepare=prepare)
 
 

@@ -1,10 +1,10 @@
-"""Golden numbers from Stable-Baselines3 itself: what our learners are held against, update by update.
+"""Golden numbers from Stable-Baselines3 itself, with which our algorithms are compared update by update.
 
     uv run --group sb3 python experiments/parity_sb3.py --out tests/golden/sb3
 
 Plays and learns with the library's own DQN, PPO and A2C, recording every minibatch, loss, clipped gradient and the weights
 around each step; epsilon over the steps; initial weights; and the order of target copies and gradient steps. The tests
-in tests/learning/test_parity.py read the files; versions are in versions.json.
+in tests/agents/test_parity.py read the files; versions are in versions.json.
 """
 
 import argparse
@@ -132,7 +132,7 @@ def play(model: Any) -> Any:
 
 
 def rollout_of(buffer: Any) -> dict[str, np.ndarray]:
-    """The rollout of one environment, as it was rollout_with_actions."""
+    """The rollout of one environment, as it was played."""
     names = ("observations", "actions", "rewards", "values", "log_probs", "advantages", "returns", "episode_starts")
     return {name: getattr(buffer, name)[:, 0].copy() for name in names}
 

@@ -2,8 +2,8 @@
 
     uv run --group sb3 python experiments/parity_training_sb3.py --out results/parity
 
-Both learn with Table 4 on the layout of seed 0 with 8 powered and 8 connected devices and are then judged greedily on the
-same volume draws. Prints the mean lifetimes with 95 % intervals over the seeds; writes them to parity.json.
+Both learn with Table 4 on the layout of seed 0 with 8 powered and 8 connected devices; the greedy policies are then evaluated
+on the same volume draws. Prints the mean lifetimes with 95 % intervals over the seeds; writes them to parity.json.
 """
 
 import argparse
@@ -64,7 +64,7 @@ def layout() -> Any:
 
 
 def draws() -> Any:
-    """The volume draws that both are judged on."""
+    """The volume draws on which both are evaluated."""
     from uavmec_jax.scenarios.seeds import held_out_draws
 
     return held_out_draws(0, 8, 8, DRAWS)
@@ -79,8 +79,9 @@ def ours(seeds: int, steps: int) -> list[float]:
     from uavmec_jax.agents.algorithm import Agent
     from uavmec_jax.env.rollout import rollouts
     from uavmec_jax.env.scenario import make_scenario
-    from uavmec_jax.training import host, population
+    from uavmec_jax.training import host
     from uavmec_jax.training.partition import partition_population
+    from uavmec_jax.training.population import train_population
     from uavmec_jax.training.training import Validation
 
     host.use_all_cores()
@@ -88,16 +89,16 @@ def ours(seeds: int, steps: int) -> list[float]:
     alone = Agent(key=jax.random.key(0), scenario=make_scenario(layout()), hyper=dqn.DQNHyper())
     agents = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (seeds, *jnp.shape(leaf))), alone)
     agents = agents.replace(key=jax.random.split(jax.random.key(1), seeds))
-    blocks = partition_population(seeds, algorithm.agent_bytes, host.free_memory())
+    partition = partition_population(seeds, algorithm.agent_bytes, host.free_memory())
     keys = jax.random.split(jax.random.key(2), (seeds, 1))
     lifetimes: list[float] = []
-    for block in population.train(algorithm, agents, keys, validation=Validation(every=steps, draws=1), blocks=blocks):
-        judged = jax.jit(jax.vmap(
-            lambda weights: rollouts(
-                algorithm.policy(dqn.DQNHyper(), weights), alone.scenario.params, alone.scenario.layout, draws()
-            ).length.mean()
-        ))(block.last)  # fmt: skip
-        lifetimes += judged.tolist()
+    params, devices, validation = alone.scenario.params, alone.scenario.layout, Validation(every=steps, draws=1)
+
+    def mean_lifetime(weights: Any) -> Any:
+        return rollouts(algorithm.policy(dqn.DQNHyper(), weights), params, devices, draws()).length.mean()
+
+    for shard in train_population(algorithm, agents, keys, validation=validation, partition=partition):
+        lifetimes += jax.jit(jax.vmap(mean_lifetime))(shard.last).tolist()
     return lifetimes
 
 
