@@ -1,4 +1,4 @@
-"""What a user hands in: scenarios, states, places and policies, with the schemas of their files."""
+"""Scenarios, states, places and policies of users, and the schemas of their files."""
 
 import lazy_loader
 

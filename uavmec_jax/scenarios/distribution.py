@@ -36,7 +36,7 @@ _SHARES = ("powered", "connected")
 
 
 def check_scenarios(scenarios: ScenarioSettings, n_devices: int) -> None:
-    """Check that every range is one, and that layouts of ``n_devices`` entries are large enough.
+    """Check that all ranges are valid, and that layouts of ``n_devices`` entries are large enough.
 
     Raises:
         ValueError: one line that names the setting.

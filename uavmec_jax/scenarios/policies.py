@@ -124,7 +124,7 @@ class TrainedPolicy:
         return np.asarray(self._greedy(array))
 
     def value(self, params: Params, layout: Layout, states: State) -> Float[Array, " B"]:
-        """Estimate the return from states with one batch axis on.
+        """Estimate the return that follows each of a batch of states, with one batch axis.
 
         Raises:
             PolicyError: the algorithm has no value network.

@@ -1,4 +1,4 @@
-"""Studies: what to train, how to evaluate it, and the results."""
+"""Studies: their files and populations, and how policies are evaluated and compared."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Evaluate one policy on one scenario, beside two heuristics."""
+"""Evaluate one policy on one scenario, together with two heuristics."""
 
 from functools import partial
 from typing import Any

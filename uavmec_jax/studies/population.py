@@ -113,7 +113,7 @@ def make_agents(study: Study, reward: Reward | None = None, agent_ids: list[Agen
 
     The randomness of an agent depends on its seed and its numbers of powered and connected devices alone: the layout on the
     seed (the cells of a seed have the same devices, fewer of them with power or communication), exploration and initial
-    weights on all three. Hyperparameters, rewards and algorithms are thus compared with common random numbers.
+    weights on all three. Hyperparameters, rewards and algorithms are thus compared under the same randomness.
 
     Args:
         study: a study of one algorithm, or one that trains nothing.
@@ -132,7 +132,7 @@ def make_agents(study: Study, reward: Reward | None = None, agent_ids: list[Agen
         scenario = Scenario(params=params, layout=layout, reward=rewards)
     else:
         scenario = make_distribution(study.scenarios, params, rewards, len(agent_ids))
-    algorithm = "dqn" if study.algorithm == "none" else study.algorithm  # hyperparameters without effect if "none"
+    algorithm = "dqn" if study.algorithm == "none" else study.algorithm  # "none" uses no hyperparameters
     registered, settings = ALGORITHMS[algorithm], getattr(study, algorithm)
     return Agent(
         key=identity_keys(Stream.TRAINING, seeds, powered, connected),
