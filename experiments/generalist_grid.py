@@ -11,6 +11,7 @@ draws say whether that was right. Writes `grid.csv`, `grid.json`, `reliability.c
 import argparse
 import json
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,11 @@ import numpy as np
 import pandas as pd
 from forecast_quality import ForecastQuality, evaluate_forecasts, forecast_first_failure, with_no_failure
 from generalist_figures import ratio_figure, reliability_figure
+from jaxtyping import Array, Key
 from reports import write_report
 
+from uavmec_jax.env.layout import Layout
+from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Policy
 from uavmec_jax.planning.parallel import policy_episodes
 from uavmec_jax.runs.results_folder import load_results
@@ -82,11 +86,10 @@ def main() -> None:
 def play(planned: Results, policy: Policy, count: int) -> tuple[pd.DataFrame, dict[str, np.ndarray]]:
     """Return mean lifetimes on the first layouts, one row each, and the policy's episodes, leaves ``[A, D, ...]``."""
     draws = planned.evaluation["bound/lifetime"].shape[1]
-    scenario, keys = make_agents(planned.study).scenario, evaluation_keys(planned.study)[:count, :draws]
+    keys = evaluation_keys(planned.study)[:count, :draws]
     batches = []
-    for first in range(0, len(keys), _PER_CALL):
-        params, layouts = batch_of((scenario.params, scenario.layout), first)
-        episodes = policy_episodes(policy, params, layouts, keys[first : first + _PER_CALL])
+    for params, layouts, batch_keys in scenario_batches(planned, keys):
+        episodes = policy_episodes(policy, params, layouts, batch_keys)
         batches.append({name: np.asarray(leaf) for name, leaf in vars(episodes).items()})
     episodes = {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
     table = planned.agents.loc[: count - 1, ["seed", "powered", "connected"]].copy()
@@ -96,9 +99,13 @@ def play(planned: Results, policy: Policy, count: int) -> tuple[pd.DataFrame, di
     return table.assign(generalist=episodes["length"].mean(axis=1)), episodes
 
 
-def batch_of(tree: Any, first: int) -> Any:
-    """Return the leaves of the scenarios that are played together, from ``first`` on."""
-    return jax.tree.map(lambda leaf: leaf[first : first + _PER_CALL], tree)
+def scenario_batches(planned: Results, keys: Key[Array, "A D"]) -> Iterator[tuple[Params, Layout, Key[Array, "B D"]]]:
+    """Yield parameters, layouts and draws of the first ``A`` scenarios in batches that are played together."""
+    scenario, count = make_agents(planned.study).scenario, len(keys)
+    for first in range(0, count, _PER_CALL):
+        batch = slice(first, min(first + _PER_CALL, count))
+        params, layouts = jax.tree.map(lambda leaf, batch=batch: leaf[batch], (scenario.params, scenario.layout))
+        yield params, layouts, keys[batch]
 
 
 def with_dqn(table: pd.DataFrame, planned: Results, trained: Results) -> pd.DataFrame:
@@ -120,11 +127,11 @@ def evaluate_policy_forecasts(
     planned: Results, policy: Policy, episodes: dict[str, np.ndarray], samples: int
 ) -> ForecastQuality:
     """Evaluate the forecasts of the first failure over all layouts and held-out draws."""
-    scenario = make_agents(planned.study).scenario
-    forecasts = []
-    for first in range(0, len(episodes["length"]), _PER_CALL):
-        params, layouts = batch_of((scenario.params, scenario.layout), first)
-        forecasts.append(forecast_first_failure(policy, params, layouts, samples))
+    keys = evaluation_keys(planned.study)[: len(episodes["length"])]
+    forecasts = [
+        forecast_first_failure(policy, params, layouts, samples)
+        for params, layouts, _ in scenario_batches(planned, keys)
+    ]
     happened = with_no_failure(episodes["first_failure"])
     forecast = np.repeat(np.concatenate(forecasts)[:, None], happened.shape[1], axis=1)
     return evaluate_forecasts(forecast.reshape(-1, forecast.shape[-1]), happened.reshape(-1, happened.shape[-1]))
