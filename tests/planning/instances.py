@@ -11,7 +11,7 @@ SLOTS = 64
 
 
 def small_instance(number: int, *, devices: int | None = None, readings: bool = True):
-    """Parameters, layout, volume key and volume table of an instance with 3 to 5 devices and a short life."""
+    """Return parameters, layout, volume key and volume table of an instance with 3 to 5 devices and a short lifetime."""
     rng = np.random.default_rng(number)
     n = devices or int(rng.integers(3, 6))
     side = float(rng.choice([80.0, 200.0, 800.0]))
@@ -36,5 +36,5 @@ def small_instance(number: int, *, devices: int | None = None, readings: bool = 
 
 
 def traced(params: Params) -> Params:
-    """The parameters as arrays, so that every instance visit_shares one compilation."""
+    """Return the parameters as arrays, so that all instances share one compilation."""
     return jax.tree.map(lambda leaf: np.float32(leaf) if isinstance(leaf, float) else np.asarray(leaf), params)

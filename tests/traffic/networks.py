@@ -93,7 +93,7 @@ def evacuation(
         road_shape=np.array([[1000, 1000], [1100, 1000], [1000, 1000], [1000, 1200], [1050, 1250]], np.float32),
         road_corners=np.array([2, 3], np.int32),
         road_lanes=np.array([1, 2], np.int32),
-        road_density=np.array([[0.0, 30.0], [4.0, 50.0]], np.float32),
+        road_density=np.array([[0.0, 30.0], [4.0, 50.0], [2.0, 40.0]], np.float32)[: len(windows)],
     )
 
 

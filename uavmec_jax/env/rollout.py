@@ -166,7 +166,7 @@ def returns(policy: Policy, scenario: Scenario, keys: Key[Array, " D"]) -> Float
 
 @struct.dataclass
 class Trace:
-    """An episode slot by slot. Slots after its end repeat the last state and outcome.
+    """An episode slot by slot, ``*batch`` = ``[H]``. Slots after its end repeat the last state and outcome.
 
     Attributes:
         played: whether the slot belongs to the episode.
@@ -175,8 +175,8 @@ class Trace:
         outcome: the outcome of each slot, leaves ``[H, ...]``.
     """
 
-    played: Bool[Array, "*batch H"]
-    action: Int[Array, "*batch H"]
+    played: Bool[Array, "*batch"]
+    action: Int[Array, "*batch"]
     state: State
     outcome: Outcome
 
