@@ -86,7 +86,9 @@ def test_right_fields_are_accepted():
     check_fields(Pair(jnp.ones(3), jnp.ones(3)))
 
 
-@pytest.mark.parametrize("tree", [PARAMS, STATE, LAYOUT.replace(traffic=Traffic(jnp.ones((2, 3))))], ids=lambda tree: type(tree).__name__)
+@pytest.mark.parametrize(
+    "tree", [PARAMS, STATE, LAYOUT.replace(traffic=Traffic(jnp.ones((2, 3))))], ids=lambda tree: type(tree).__name__
+)
 def test_constructors_accept_sentinels(tree):
     leaves, structure = jax.tree.flatten(tree)
     sentinel = object()
