@@ -1,4 +1,4 @@
-"""The environment: signatures, auto-reset, observation, known lifetimes, invariants."""
+"""The environment: signatures, automatic resets, observations, lifetimes worked out by hand, invariants."""
 
 import chex
 import jax
@@ -90,12 +90,14 @@ def test_nothing_powered_or_connected_lives_11_slots_without_shared_hover_points
 
 @both_modes
 def test_rollout_gives_two_policies_the_same_volumes():
-    seen = {}
+    batteries = {}
 
-    def spying(name, action):
+    def recording(name, action):
         def policy(params, layout, state, key=None):
             jax.debug.callback(
-                lambda battery, slot: seen.setdefault((name, int(slot)), np.asarray(battery)), state.battery, state.slot
+                lambda battery, slot: batteries.setdefault((name, int(slot)), np.asarray(battery)),
+                state.battery,
+                state.slot,
             )
             return jnp.int32(action)
 
@@ -103,12 +105,12 @@ def test_rollout_gives_two_policies_the_same_volumes():
 
     layout = layout_of(2, 0, 12)
     for name in ("a", "b"):
-        rollout(spying(name, 3), PARAMS, layout, jax.random.key(7))
+        rollout(recording(name, 3), PARAMS, layout, jax.random.key(7))
     jax.effects_barrier()
-    slots = {slot for _, slot in seen}
+    slots = {slot for _, slot in batteries}
     assert len(slots) > 5
     for slot in slots:
-        assert_array_equal(seen["a", slot], seen["b", slot])
+        assert_array_equal(batteries["a", slot], batteries["b", slot])
 
 
 def test_rollouts_differ_by_draw_and_repeat_by_key():

@@ -35,7 +35,7 @@ class State:
     Attributes:
         battery: energy left in each device, J.
         age: slots since each device's data were last delivered, int32.
-        uav_position: m.
+        uav_position: position of the UAV, m.
         uav_energy: energy left in the UAV, J.
         slot: slots completed, int32.
         elapsed: total length of the slots completed, s.

@@ -42,15 +42,15 @@ class Layout:
     """The devices of one scenario; every field has one entry per device.
 
     Attributes:
-        position: m, in the region.
+        position: coordinates in the region, m.
         device_type: index into :data:`hardware.DEVICE_TYPES`.
         task: index into :data:`hardware.TASKS`.
         capacity: battery capacity, J.
         has_power: whether the device has grid power (delta_E = 0).
         has_comms: whether the device has communication (delta_C = 0).
-        standby_power: W, given by the type.
-        active_power: W, given by type and task.
-        processing_rate: bytes/s, given by type and task.
+        standby_power: given by the type, W.
+        active_power: given by type and task, W.
+        processing_rate: given by type and task, bytes/s.
         traffic: the traffic around the devices, ``None`` if it is unknown.
         present: which entries are devices and not padding (:func:`pad_layout`); ``None`` if all are.
     """
@@ -82,7 +82,7 @@ def make_layout(
     has_power: Bool[Array, " n"],
     has_comms: Bool[Array, " n"],
 ) -> Layout:
-    """Look up powers and rates (Tables 1-3) and return the complete :class:`Layout`; its fields describe the arguments."""
+    """Return a :class:`Layout` of the given devices, with powers and rates looked up by type and task (Tables 1-3)."""
     chex.assert_shape([device_type, task, capacity, has_power, has_comms], (position.shape[0],))
     chex.assert_shape(position, (None, 2))
     return Layout(

@@ -1,4 +1,4 @@
-"""Whole episodes: every policy, learned or not, is evaluated by this loop."""
+"""Episodes: every policy, learned or not, is evaluated by these loops."""
 
 from collections.abc import Callable
 

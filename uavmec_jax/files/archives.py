@@ -96,7 +96,7 @@ def _open_archive(path: Path) -> Iterator[Any]:
     """Open an ``.npz`` without pickle."""
     with path.open("rb") as file:
         archive = np.load(file, allow_pickle=False)
-        if not isinstance(archive, np.lib.npyio.NpzFile):
+        if not isinstance(archive, np.lib.npyio.NpzFile) or archive.zip is None:
             raise ValueError("it holds a single array")
         if any(member.flag_bits & 1 for member in archive.zip.infolist()):  # zipfile would ask for a password
             raise ValueError("it is encrypted")
