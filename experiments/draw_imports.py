@@ -65,9 +65,9 @@ def read_imports(root: Path) -> list[Import]:
     """Read all imports of all modules, also those of other packages."""
     known = modules(root)
     return [
-        found
+        item
         for module, file in known.items()
-        for found in _imports(module, ast.parse(file.read_text(encoding="utf-8")), known, file.name == "__init__.py")
+        for item in _imports(module, ast.parse(file.read_text(encoding="utf-8")), known, file.name == "__init__.py")
     ]
 
 
@@ -97,12 +97,12 @@ def count_between_rooms(imports: list[Import]) -> tuple[Counter[tuple[str, str]]
     """Count pairs of modules by their rooms ``(importer, imported)``: at module level, and inside functions only."""
     counts: tuple[Counter, Counter] = (Counter(), Counter())
     pairs: dict[tuple[str, str], bool] = {}
-    for one in imports:
-        rooms = room_of(one.importer), room_of(one.imported)
-        ours = one.imported.split(".")[0] == PACKAGE
-        if ours and not one.typing_only and rooms[0] != rooms[1] and not set(rooms) & set(NO_ROOM):
-            pair = one.importer, one.imported
-            pairs[pair] = pairs.get(pair, True) and bool(one.function)
+    for item in imports:
+        rooms = room_of(item.importer), room_of(item.imported)
+        is_internal = item.imported.split(".")[0] == PACKAGE
+        if is_internal and not item.typing_only and rooms[0] != rooms[1] and not set(rooms) & set(NO_ROOM):
+            pair = item.importer, item.imported
+            pairs[pair] = pairs.get(pair, True) and bool(item.function)
     for (importer, imported), inside in pairs.items():
         counts[inside][room_of(importer), room_of(imported)] += 1
     return counts
