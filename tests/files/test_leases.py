@@ -27,7 +27,7 @@ def test_one_process_holds_it_until_it_releases_it(tmp_path):
     mine, other = Leases(), Leases()
     lease = mine.claim(tmp_path / "shard")
     assert other.claim(tmp_path / "shard") is None
-    with pytest.raises(StudyError, match=r"shard: process \d+ on .* is at work in it; to help, call"):
+    with pytest.raises(StudyError, match=r"shard: process \d+ on .* is working in it; to help, call"):
         other.hold(tmp_path / "shard", tmp_path / "shard", "; to help, call")
     lease.check()
     lease.release()

@@ -192,7 +192,7 @@ def test_a_second_process_is_refused_with_the_name_of_the_first(tmp_path):
     run_study(STUDY, tmp_path / "run", on_progress=second)
     assert len(messages) == 2
     for line in messages:
-        assert re.search(r"run: process \d+ on \S+ is at work in it; to help it, start `uavmec worker .*run`", line)
+        assert re.search(r"run: process \d+ on \S+ is working in it; to help it, start `uavmec worker .*run`", line)
 
 
 def test_workers_share_a_run_and_the_last_one_assembles_the_results(whole, tmp_path):

@@ -162,7 +162,7 @@ class Leases:
                 continue
             first = holder if first is None else first
             if holder.get("machine") == this_machine() or holder.get("heartbeat") != first.get("heartbeat"):
-                raise StudyError(f"{of}: {describe_holder(holder)} is at work in it{more}")
+                raise StudyError(f"{of}: {describe_holder(holder)} is working in it{more}")
             time.sleep(min(1.0, self.lease_s / 4))
         return lease
 

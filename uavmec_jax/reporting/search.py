@@ -91,7 +91,7 @@ def search_json(result: SearchResult) -> dict[str, Any]:
         "space": result.space.model_dump(mode="json"),
         "best": result.best,
         "value": result.value,
-        "own_value": result.own_value,
+        "baseline_value": result.baseline_value,
         "importance": result.importance,
         "trials": json.loads(result.trials.to_json(orient="records")),
     }

@@ -24,7 +24,7 @@ def status_lines(status: Status) -> list[str]:
     lines += _truncate(status.workers)
     lines += _truncate([f"shard {number} failed: {why}" for number, why in status.failures.items()])
     if not status.complete and not status.workers:
-        lines.append(f"nobody is at work; go on with: uavmec resume {status.directory}")
+        lines.append(f"no worker is running; resume with: uavmec resume {status.directory}")
     return lines
 
 

@@ -21,7 +21,7 @@ def check_directory(directory: Path) -> None:
         StudyError: it is not empty, another process works in it, or it is a file.
     """
     if (holder := Leases().holder(directory / SHARDS)) is not None:
-        raise StudyError(f"{directory}: {describe_holder(holder)} is at work in it{worker_hint(directory)}")
+        raise StudyError(f"{directory}: {describe_holder(holder)} is working in it{worker_hint(directory)}")
     check_empty(directory)
 
 

@@ -10,7 +10,7 @@ import pydantic
 from jaxtyping import Int, Num
 from pydantic import Field
 
-from uavmec_jax.env.dynamics import State, initial_state, slots_to_expiry
+from uavmec_jax.env.dynamics import State, slots_to_expiry
 from uavmec_jax.errors import StateError
 from uavmec_jax.files.reading import read_text
 from uavmec_jax.files.validation import StrictModel, describe_error, from_array
@@ -60,7 +60,7 @@ def make_state(data: dict[str, Any], scenario: NamedScenario, source: str) -> St
 
     Args:
         data: contents of the file, as parsed from JSON.
-        scenario: the scenario in this state.
+        scenario: the scenario, in its initial state.
         source: name of the file, for messages.
 
     Raises:
@@ -77,10 +77,9 @@ def make_state(data: dict[str, Any], scenario: NamedScenario, source: str) -> St
 
 
 def _build(file: StateFile, scenario: NamedScenario) -> State:
-    initial = initial_state(scenario.params, scenario.layout)
     capacity, uav_battery = np.asarray(scenario.layout.capacity, float), float(scenario.params.uav_battery_j)
-    battery = _by_device("battery_j", file.battery_j, np.asarray(initial.battery, float), scenario)
-    age = _by_device("age_slots", file.age_slots, np.asarray(initial.age), scenario)
+    battery = _by_device("battery_j", file.battery_j, np.asarray(scenario.state.battery, float), scenario)
+    age = _by_device("age_slots", file.age_slots, np.asarray(scenario.state.age), scenario)
     _check_devices(battery, age, scenario)
     energy = uav_battery if file.uav_energy_j is None else file.uav_energy_j
     if not 0 < energy <= uav_battery * (1 + 1e-6):

@@ -9,7 +9,7 @@ from uavmec_jax.studies.compare import Side
 from uavmec_jax.studies.study import load_study
 from uavmec_jax.training.population import Progress
 
-OWN, BEST = "own", "best"
+BASELINE, BEST = "baseline", "best"
 """Folders of the two runs, inside the folder of the search."""
 
 
@@ -24,9 +24,9 @@ def confirm(
 
     Args:
         result: the result of the search.
-        directory: folder of the search; the runs are in its folders ``own`` and ``best``.
+        directory: folder of the search; the runs are in its folders ``baseline`` and ``best``.
         command: the command line, for the labels of the runs.
-        on_progress: called with the name of the run, ``own`` or ``best``, and its progress.
+        on_progress: called with the name of the run, ``baseline`` or ``best``, and its progress.
 
     Returns:
         The study with its own settings, and with the best ones.
@@ -39,7 +39,7 @@ def confirm(
     best = best_study(result)
     best = best.model_copy(update={"axes": best.axes | {"seeds": space.confirm_seeds}})
     sides = []
-    for name, study in ((OWN, baseline), (BEST, best)):
+    for name, study in ((BASELINE, baseline), (BEST, best)):
 
         def report(progress: Progress, name: str = name) -> None:
             on_progress(name, progress)

@@ -78,7 +78,7 @@ class SearchResult:
         return float(self.trials.loc[self.trials["state"] == "complete", "value"].max())
 
     @property
-    def own_value(self) -> float:
+    def baseline_value(self) -> float:
         """The objective of the study's own settings (trial 0); if that trial was pruned, its score at the last rung."""
         return float(self.trials.loc[self.trials["number"] == 0, "value"].iloc[0])
 
