@@ -1,4 +1,4 @@
-"""Small random instances that can be solved exactly, with every reading of the model among them."""
+"""Small random instances that can be solved exactly; they cover every reading of the model."""
 
 import jax
 import numpy as np
@@ -10,9 +10,9 @@ from uavmec_jax.env.rollout import volume_table
 SLOTS = 64
 
 
-def small_instance(number: int, *, devices: int | None = None, readings: bool = True):
+def small_instance(seed: int, *, devices: int | None = None, readings: bool = True):
     """Return parameters, layout, volume key and volume table of an instance with 3 to 5 devices and a short lifetime."""
-    rng = np.random.default_rng(number)
+    rng = np.random.default_rng(seed)
     n = devices or int(rng.integers(3, 6))
     side = float(rng.choice([80.0, 200.0, 800.0]))
     low = float(rng.uniform(3e3, 2e4))
@@ -30,8 +30,8 @@ def small_instance(number: int, *, devices: int | None = None, readings: bool = 
         uav_flying_power_w=float(rng.choice([40.0, 150.0])),
         max_slots=SLOTS,
     )
-    layout = sample_layout(jax.random.key(number), params, int(rng.integers(0, n)), int(rng.integers(0, n)))
-    key = jax.random.key(1000 + number)
+    layout = sample_layout(jax.random.key(seed), params, int(rng.integers(0, n)), int(rng.integers(0, n)))
+    key = jax.random.key(1000 + seed)
     return params, layout, key, volume_table(params, n, key, SLOTS)
 
 

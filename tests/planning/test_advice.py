@@ -1,4 +1,4 @@
-"""Advice: the next visit, the expected lifetime, and the first failure, from many futures."""
+"""Advice: the next visit, its forecast, and what a repair brings."""
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +10,7 @@ from tests.small_scenarios import mid_life
 from uavmec_jax.env.dynamics import initial_state
 from uavmec_jax.env.layout import Traffic
 from uavmec_jax.env.rollout import rollouts
+from uavmec_jax.planning import advice as advice_module
 from uavmec_jax.planning.advice import advise
 from uavmec_jax.planning.changes import CHANGES
 from uavmec_jax.planning.heuristics import HEURISTICS
@@ -31,7 +32,7 @@ def advice(scenario):
 
 def test_the_best_candidate_comes_first(advice):
     lifetimes = [candidate.lifetime for candidate in advice.candidates]
-    assert advice.candidates[0].device == advice.device
+    assert advice.device == advice.candidates[0].device
     assert lifetimes[1:] == sorted(lifetimes[1:], reverse=True)
     assert lifetimes[0] >= lifetimes[1] - 1e-3
     assert {candidate.device for candidate in advice.candidates} == set(range(6))
@@ -48,28 +49,48 @@ def test_the_forecast_is_that_of_the_best_candidate(advice):
     assert forecast.lifetimes.min() <= low <= forecast.lifetimes.mean() <= high <= forecast.lifetimes.max()
     assert 0 <= forecast.first_failure.sum() <= 1 + 1e-6
     assert_allclose(sum(forecast.causes.values()), 1)
-    fails_first = forecast.first_failure > 0
-    assert_array_equal(np.isfinite(forecast.failure_slot), fails_first)
-    assert (forecast.failure_slot[fails_first] >= forecast.lifetimes.min()).all()
-    assert (forecast.failure_slot[fails_first] <= forecast.lifetimes.max()).all()
+    fails = forecast.first_failure > 0
+    assert_array_equal(np.isfinite(forecast.failure_slot), fails)
+    assert (forecast.failure_slot[fails] >= forecast.lifetimes.min()).all()
+    assert (forecast.failure_slot[fails] <= forecast.lifetimes.max()).all()
 
 
 def test_lifetimes_count_from_the_first_slot(scenario, advice):
     assert advice.forecast.lifetimes.min() > int(scenario[2].slot)
 
 
-def test_every_repair_and_removal_is_tried(scenario, advice):
+def test_what_if_has_every_repair_and_removal(scenario, advice):
     _, layout, _ = scenario
-    repairs = np.sum(~np.asarray(layout.has_power)) + np.sum(~np.asarray(layout.has_comms))
-    assert len(advice.what_if) == repairs + 6
-    gains = [entry.gain for entry in advice.what_if]
+    lacks = np.sum(~np.asarray(layout.has_power)) + np.sum(~np.asarray(layout.has_comms))
+    assert len(advice.what_if) == lacks + 6
+    gains = [effect.gain for effect in advice.what_if]
     assert gains == sorted(gains, reverse=True)
-    assert {entry.change for entry in advice.what_if} == set(CHANGES)
+    assert {effect.change for effect in advice.what_if} == set(CHANGES)
+
+
+def test_advising_again_compiles_nothing(scenario):
+    """One compilation serves every state, layout and setting of the same sizes."""
+    params, layout, state = scenario
+    jitted = (advice_module._try_candidates, advice_module._lifetimes)
+    advise(POLICY, params, layout, state, samples=4, what_if=True)
+    compiled = [function._cache_size() for function in jitted]
+    other_params, other_layout, other_state = mid_life(6, 6, uav_speed_m_s=8.0)
+    advise(POLICY, params, layout, other_state, samples=4, what_if=True)
+    advise(POLICY, params, layout, samples=4, what_if=True)
+    advise(POLICY, other_params, other_layout, other_state, key=jax.random.key(9), samples=4, what_if=True)
+    assert [function._cache_size() for function in jitted] == compiled
+
+
+def test_a_batch_of_states_is_refused(scenario):
+    params, layout, state = scenario
+    states = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), state)
+    with pytest.raises(AssertionError, match="shape"):
+        advise(POLICY, params, layout, states, samples=4)
 
 
 @pytest.mark.slow
-def test_the_policys_choice_is_kept_unless_another_is_better():
-    """With power and communication everywhere, and all devices at one place, every visit is worth the same."""
+def test_the_policys_own_choice_is_kept_where_nothing_is_better():
+    """With power and communication everywhere and all devices at one place, no visit is better than another."""
     params, layout, _ = mid_life(0, 3)
     layout = layout.replace(has_power=jnp.ones(3, bool), has_comms=jnp.ones(3, bool), position=jnp.zeros((3, 2)))
     advice = advise(POLICY, params, layout, samples=8)
@@ -78,43 +99,41 @@ def test_the_policys_choice_is_kept_unless_another_is_better():
 
 
 @pytest.mark.slow
-def test_the_forecast_agrees_with_independent_futures(scenario):
+def test_forecasts_agree_with_independent_futures(scenario):
     """Probabilities from other futures agree within 4 standard errors."""
     params, layout, _ = scenario
     advice = advise(POLICY, params, layout, samples=256)
-    forecast = advice.forecast
 
     def policy(params, layout, state, key=None):
         return jnp.where(state.slot == 0, advice.device, POLICY(params, layout, state, key))
 
     keys = jax.random.split(jax.random.key(99), 256)
-    played = jax.jit(lambda: rollouts(policy, params, layout, keys))()
-    share = np.asarray(played.first_failure).mean(axis=0)
-    assert np.abs(share - forecast.first_failure).max() < 4 * np.sqrt(2 * 0.25 / 256)
-    error = 4 * np.sqrt(2) * max(forecast.lifetimes.std(), 0.5) / 16
-    assert abs(np.asarray(played.length).mean() - forecast.lifetimes.mean()) < error
+    episodes = jax.jit(lambda: rollouts(policy, params, layout, keys))()
+    share = np.asarray(episodes.first_failure).mean(axis=0)
+    assert np.abs(share - advice.forecast.first_failure).max() < 4 * np.sqrt(2 * 0.25 / 256)
+    lifetimes = advice.forecast.lifetimes
+    error = 4 * np.sqrt(2) * max(lifetimes.std(), 0.5) / 16
+    assert abs(np.asarray(episodes.length).mean() - lifetimes.mean()) < error
 
 
 @pytest.mark.slow
 def test_same_key_same_advice(scenario):
     params, layout, state = scenario
-    again = [advise(POLICY, params, layout, state, key=jax.random.key(k), samples=32) for k in (3, 3, 4)]
-    assert_array_equal(again[0].forecast.lifetimes, again[1].forecast.lifetimes)
+    first, again = (advise(POLICY, params, layout, state, key=jax.random.key(3), samples=32) for _ in range(2))
+    assert_array_equal(first.forecast.lifetimes, again.forecast.lifetimes)
     start = advise(POLICY, params, layout, initial_state(params, layout), samples=32)
     assert_array_equal(start.forecast.lifetimes, advise(POLICY, params, layout, samples=32).forecast.lifetimes)
 
 
 @pytest.mark.slow
 def test_the_price_of_a_failure_counts(scenario):
-    """Advice that knows the prices reaches at least the value of advice that ignores them."""
+    """Advice that knows the prices is worth at least as much as advice that does not."""
     params, layout, state = scenario
-    unpriced = advise(POLICY, params, layout, state, samples=SAMPLES)
-    weight = jnp.asarray(unpriced.forecast.first_failure, jnp.float32)[None]
+    free = advise(POLICY, params, layout, state, samples=SAMPLES)
+    weight = jnp.asarray(free.forecast.first_failure, jnp.float32)[None]
     priced_layout = layout.replace(traffic=Traffic(weight, jnp.float32(jnp.inf), jnp.float32(50.0)))
-    with_prices = advise(POLICY, params, priced_layout, state, samples=SAMPLES)
-    cost = 50.0 * np.asarray(weight[0])
-    value = [
-        advice.forecast.lifetimes.mean() - advice.forecast.first_failure @ cost for advice in (unpriced, with_prices)
-    ]
+    priced = advise(POLICY, params, priced_layout, state, samples=SAMPLES)
+    price = 50.0 * np.asarray(weight[0])
+    value = [one.lifetimes.mean() - one.first_failure @ price for one in (free.forecast, priced.forecast)]
     assert value[1] >= value[0] - 1e-3
-    assert all(candidate.behind >= -1e-3 for candidate in with_prices.candidates)
+    assert all(candidate.behind >= -1e-3 for candidate in priced.candidates)

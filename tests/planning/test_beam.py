@@ -1,4 +1,4 @@
-"""The clairvoyant beam: its tours are real, its pruning is sound, and it finds shared hover points."""
+"""Beam search: its tours are feasible, its pruning is sound, and it finds shared hover points."""
 
 import jax
 import jax.numpy as jnp
@@ -18,14 +18,14 @@ PARAMS = traced(Params())
 
 
 def layout_with_a_pair():
-    """Return a layout without power or communication in which devices 0 and 1 can be served together."""
+    """Return a layout without any power or communication in which devices 0 and 1 can be served together."""
     layout = layout_for_seed(0, PARAMS, 0, 0)
     position = jnp.stack([200.0 * (jnp.arange(12) % 4), 300.0 * (jnp.arange(12) // 4)], axis=1)
     return layout.replace(position=position.at[1].set(position[0] + 40.0), capacity=jnp.full(12, 79_000.0))
 
 
 @pytest.mark.parametrize(("powered", "connected", "seed"), [(8, 8, 3), (4, 4, 14)])
-def test_the_tour_reaches_its_lifetime_in_simulation(powered, connected, seed):
+def test_the_tour_reaches_its_lifetime(powered, connected, seed):
     layout, key = layout_for_seed(seed, PARAMS, powered, connected), jax.random.key(seed)
     tour = search(PARAMS, layout, volume_table(PARAMS, 12, key, SLOTS), 64)
     episode = rollout(tour_policy(tour.actions), PARAMS, layout, key)
@@ -35,20 +35,25 @@ def test_the_tour_reaches_its_lifetime_in_simulation(powered, connected, seed):
     assert (visits[int(tour.lifetime) :] == -1).all()
 
 
-def test_a_shared_hover_point_allows_more_than_eleven_slots():
+def test_a_shared_hover_point_lets_the_network_outlive_eleven_slots():
     layout = layout_with_a_pair()
     tour = search(PARAMS, layout, volume_table(PARAMS, 12, jax.random.key(0), SLOTS), 64)
     assert tour.lifetime > 11
 
 
-def test_the_search_starts_from_a_given_bound():
+def test_the_search_starts_from_a_known_upper_bound():
     layout = layout_for_seed(3, PARAMS, 8, 8)
     volumes = volume_table(PARAMS, 12, jax.random.key(0), SLOTS)
-    unlimited, limited = (
-        jax.jit(lambda bound: beam_search(PARAMS, layout, volumes, 16, bound))(bound) for bound in (99, 15)
-    )
-    assert limited.bound == 15
-    assert limited.lifetime == 15 < unlimited.lifetime
+    bounded_search = jax.jit(lambda bound: beam_search(PARAMS, layout, volumes, 16, upper_bound=bound))
+    loose, tight = bounded_search(99), bounded_search(15)
+    assert tight.bound == 15
+    assert tight.lifetime == 15 < loose.lifetime
+
+
+def test_volumes_of_another_number_of_devices_are_refused():
+    layout = layout_for_seed(3, PARAMS, 8, 8)
+    with pytest.raises(AssertionError, match="shape"):
+        beam_search(PARAMS, layout, jnp.zeros((SLOTS, 11)))
 
 
 def test_dominance():
@@ -61,25 +66,25 @@ def test_dominance():
         uav_energy=states.uav_energy.at[3].add(1.0),  # more energy than 0, but at another hover point
     )
     hover_point, alive = jnp.array([5, 5, 5, 6, 5]), jnp.ones(5, bool)
-    assert _dominated(layout, states, hover_point, alive).tolist() == [False, True, True, False, True]  # 4 repeats 0
+    assert _dominated(layout, states, hover_point, alive).tolist() == [False, True, True, False, True]  # 4 is 0 again
     without_0 = _dominated(layout, states, hover_point, alive.at[0].set(False))
     assert without_0[1:].tolist() == [True, True, False, False]  # 4 takes its place
-    lacking_nothing = layout.replace(has_comms=jnp.ones(12, bool), has_power=jnp.ones(12, bool))
-    assert _dominated(lacking_nothing, states, hover_point, alive).tolist() == [False, True, True, False, True]
+    carefree = layout.replace(has_comms=jnp.ones(12, bool), has_power=jnp.ones(12, bool))
+    assert _dominated(carefree, states, hover_point, alive).tolist() == [False, True, True, False, True]
 
 
-def test_shares_never_charge_a_hover_point_more_than_one_visit():
+def test_visit_shares_of_a_hover_point_sum_to_at_most_one():
     for seed in range(8):
         params = Params(region_m=(150.0, 150.0))
         layout = layout_for_seed(seed, params, 6, 6)
         covers = demand.coverage(params, layout)
-        charged = demand.visit_shares(layout, covers)
-        assert (covers @ charged).max() <= 1 + 1e-6
+        share = demand.visit_shares(layout, covers)
+        assert (covers @ share).max() <= 1 + 1e-6
         needy = ~(layout.has_power & layout.has_comms)
-        assert ((charged > 0) == needy).all()
+        assert ((share > 0) == needy).all()
 
 
-def test_battery_visits_skip_the_largest_savings_first():
+def test_battery_visits_count_the_largest_savings_first():
     layout = layout_for_seed(0, PARAMS, 11, 12)
     volumes = volume_table(PARAMS, 12, jax.random.key(0), SLOTS)
     costs = jax.jit(demand.slot_costs)(PARAMS, layout, volumes)
@@ -89,11 +94,11 @@ def test_battery_visits_skip_the_largest_savings_first():
     np.testing.assert_allclose(need.saved[:4, device], np.concatenate([[0.0], np.cumsum(saving[:3])]), rtol=1e-5)
     battery = jnp.full(12, need.drain[device] - saving[:2].sum() + 1.0)
     visits = jax.jit(demand.battery_visits)
-    whole, part, hopeless = visits(layout, need, battery)
+    whole, fractional, infeasible = visits(layout, need, battery)
     assert whole[device] == 2
-    assert 1 < part[device] <= 2
+    assert 1 < fractional[device] <= 2
     assert whole.sum() == 2  # powered devices need none
-    assert not hopeless.any()
+    assert not infeasible.any()
     assert visits(layout, need, jnp.zeros(12))[2][device]
 
 

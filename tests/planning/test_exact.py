@@ -1,4 +1,4 @@
-"""The oracle itself, against every tour there is."""
+"""Exhaustive search against the enumeration of all tours."""
 
 import itertools
 
@@ -16,26 +16,26 @@ pytestmark = pytest.mark.slow
 LENGTH = 7
 
 
-def every_life(params, layout, key):
-    """Lifetimes of all tours of :data:`LENGTH` slots that then stay where they are."""
+def all_lifetimes(params, layout, key):
+    """Return the lifetimes of all tours of :data:`LENGTH` slots that then stay at their last device."""
     tours = np.array(list(itertools.product(range(3), repeat=LENGTH)), np.int32)
     tours = np.concatenate([tours, np.repeat(tours[:, -1:], SLOTS - LENGTH, axis=1)], axis=1)
-    play = jax.jit(jax.vmap(lambda tour: rollout(tour_policy(tour), params, layout, key).length))
-    return np.asarray(play(jnp.asarray(tours)))
+    simulate = jax.jit(jax.vmap(lambda tour: rollout(tour_policy(tour), params, layout, key).length))
+    return np.asarray(simulate(jnp.asarray(tours)))
 
 
-@pytest.mark.parametrize("number", [12, 15, 22])
-def test_exact_is_the_best_of_every_tour(number):
-    params, layout, key, volumes = small_instance(number, devices=3)
-    params = params.replace(max_slots=LENGTH)  # no life is longer than the tours enumerated
-    found = exact_tour(traced(params), layout, np.asarray(volumes))
-    lives = every_life(params, layout, key)
-    assert lives.min() < lives.max() <= LENGTH
-    assert found.lifetime == lives.max()
-    assert rollout(tour_policy(jnp.asarray(found.actions)), params, layout, key).length == found.lifetime
+@pytest.mark.parametrize("seed", [12, 15, 22])
+def test_exact_is_the_best_of_all_tours(seed):
+    params, layout, key, volumes = small_instance(seed, devices=3)
+    params = params.replace(max_slots=LENGTH)  # no lifetime exceeds the length of the enumerated tours
+    tour = exact_tour(traced(params), layout, np.asarray(volumes))
+    lifetimes = all_lifetimes(params, layout, key)
+    assert lifetimes.min() < lifetimes.max() <= LENGTH
+    assert tour.lifetime == lifetimes.max()
+    assert rollout(tour_policy(tour.actions), params, layout, key).length == tour.lifetime
 
 
-def test_too_large_is_said():
+def test_a_large_instance_is_refused():
     params, layout, _, volumes = small_instance(5, devices=5)
     with pytest.raises(ValueError, match="more than 2 states"):
         exact_tour(traced(params), layout, np.asarray(volumes), max_states=2)

@@ -43,21 +43,19 @@ FEATURES: tuple[Feature, ...] = (
     Feature("saving", "share of a slot's energy", "energy that a service saves, Tables 2-3"),
     Feature("services", "per slot of the horizon", "services its battery needs to survive the feasible horizon, whole"),
     Feature("missing", "8 services, -2 to 2", "the same before rounding; negative if energy is left over"),
-    Feature("age", "share of the age limit", "data age, equation (1f)"),
-    Feature("due", "share of the age limit, 2 for never", "slots until its data expire"),
-    Feature("crowding", "share of the age limit", "visits due no later (shared ones in part) minus slots until then"),
+    Feature("age", "share of slots to expiry", "data age, equation (1f)"),
+    Feature("due", "share of slots to expiry, 2 for never", "slots until its data expire"),
+    Feature("crowding", "share of slots to expiry", "visits due no later (shared ones in part) minus slots until then"),
     Feature("due_rank", "share of the devices", "devices whose data expire earlier"),
     Feature("empties_rank", "share of the devices", "batteries in need of services that run out earlier"),
     Feature("flight", "expected slots, at most 2", "flight time from the UAV over the length of the slot there"),
     Feature("here", "0 or 1", "whether the UAV hovers above it"),
     Feature("together", "4 devices", "devices without power or communication that are served from here, equation (4)"),
-    Feature("oldest_served", "share of the age limit", "age of the oldest data collected from here"),
+    Feature("oldest_served", "share of slots to expiry", "age of the oldest data collected from here"),
     Feature("slot_length", "share of the longest", "expected length of a slot with the UAV here"),
     Feature("uav_use", "share of the energy left", "expected energy that a visit here costs the UAV, equation (1c)"),
-    Feature(
-        "spare_after", "8 slots, -2 to 2", "slots of the feasible horizon not needed for visits, after a visit here"
-    ),
-    Feature("crowding_after", "share of the age limit", "crowding of the tightest deadline, after a visit here"),
+    Feature("spare_after", "8 slots, -2 to 2", "slots of the horizon not needed for visits, after a visit here"),
+    Feature("crowding_after", "share of slots to expiry", "crowding of the tightest deadline, after a visit here"),
     Feature("on_time_after", "0 or 1", "whether all data can still be collected in time after a visit here"),
     Feature("traffic_price", "8 slots", "traffic weight times the price of a first failure there"),
     Feature("hoped", "32 slots", "the feasible horizon: the most slots into which all visits needed fit"),
@@ -96,22 +94,29 @@ def observe_devices(params: Params, layout: Layout, state: State) -> Observation
     n = layout.capacity.shape[0]
     mask = jnp.ones(n, bool) if layout.present is None else layout.present
     count = jnp.sum(mask).astype(jnp.float32)
-    known = _Known.of(params, layout)
-    slots, services = deadlines.feasible_horizon(params, layout, state, known.mean, known.visit_share)
-    columns = {
-        **_battery_features(layout, state, known, slots, services, count),
-        **_age_features(params, layout, state, known, count),
-        **_visit_features(params, layout, state, known, mask),
-        **_after_visit_features(params, layout, state, known, slots),
+    derived = _Derived.of(params, layout)
+    slots, services = deadlines.feasible_horizon(params, layout, state, derived.mean, derived.visit_share)
+    per_device = {
+        **_battery_features(layout, state, derived, slots, services, count),
+        **_age_features(params, layout, state, derived, count),
+        **_visit_features(params, layout, state, derived, mask),
+        **_after_visit_features(params, layout, state, derived, slots),
         "traffic_price": layout.failure_price(state.elapsed) / 8.0,
-        **_shared_features(params, layout, state, known, slots, services, count),
     }
-    in_order = [jnp.broadcast_to(jnp.asarray(columns[feature.name], jnp.float32), (n,)) for feature in FEATURES]
-    return Observation(features=jnp.where(mask[:, None], jnp.stack(in_order, axis=-1), 0.0), mask=mask)
+    shared = _shared_features(params, layout, state, derived, slots, services, count)
+    features = jnp.concatenate([_stack(per_device), jnp.broadcast_to(_stack(shared), (n, len(shared)))], axis=-1)
+    chex.assert_shape(features, (n, len(FEATURES)))
+    return Observation(features=jnp.where(mask[:, None], features, 0.0), mask=mask)
 
 
-class _Known(NamedTuple):
-    """What follows from the parameters and the layout alone.
+def _stack(features: dict[str, Array]) -> Float[Array, "*n F"]:
+    """Stack features along a new last axis, in the order of :data:`FEATURES`."""
+    names = [feature.name for feature in FEATURES if feature.name in features]
+    return jnp.stack([jnp.asarray(features[name], jnp.float32) for name in names], axis=-1)
+
+
+class _Derived(NamedTuple):
+    """Quantities derived from the parameters and the layout alone.
 
     Attributes:
         mean: the expected slot.
@@ -130,7 +135,7 @@ class _Known(NamedTuple):
     use: Float[Array, "n n"]
 
     @classmethod
-    def of(cls, params: Params, layout: Layout) -> "_Known":
+    def of(cls, params: Params, layout: Layout) -> "_Derived":
         covers = demand.coverage(params, layout)
         mean = demand.mean_slot(params, layout)
         work = jnp.where(covers, mean.upload, mean.work)
@@ -149,23 +154,23 @@ class _Known(NamedTuple):
 def _battery_features(
     layout: Layout,
     state: State,
-    known: _Known,
+    derived: _Derived,
     slots: Float[Array, ""],
     services: Float[Array, " n"],
     count: Float[Array, ""],
 ) -> dict[str, Array]:
     """Return the features of the batteries and of the services they need to survive ``slots`` slots."""
-    mean = known.mean
+    mean = derived.mean
     unpowered = lambda value, otherwise: jnp.where(layout.has_power, otherwise, value)  # noqa: E731
     visited = layout.standby_power * jnp.min(mean.duration) + mean.upload
     saving = jnp.maximum(mean.work - mean.upload, 0.0)
-    missing = (slots * known.drain - state.battery) / jnp.maximum(saving, 1e-3)
-    empty_in = jnp.where(services > 0, state.battery / jnp.maximum(known.drain, 1e-6), jnp.inf)
+    missing = (slots * derived.drain - state.battery) / jnp.maximum(saving, 1e-3)
+    empty_in = jnp.where(services > 0, state.battery / jnp.maximum(derived.drain, 1e-6), jnp.inf)
     return {
         "lacks_power": unpowered(1.0, 0.0),
-        "life_unvisited": unpowered(_lifetime(state.battery, known.drain), 2.0),
+        "life_unvisited": unpowered(_lifetime(state.battery, derived.drain), 2.0),
         "life_visited": unpowered(_lifetime(state.battery, visited), 2.0),
-        "saving": unpowered(saving / jnp.maximum(known.drain, 1e-3), 0.0),
+        "saving": unpowered(saving / jnp.maximum(derived.drain, 1e-3), 0.0),
         "services": services / slots,
         "missing": unpowered(jnp.clip(missing / 8.0, -2.0, 2.0), -2.0),
         "empties_rank": jnp.where(services > 0, _rank(empty_in) / count, 1.0),
@@ -173,12 +178,12 @@ def _battery_features(
 
 
 def _age_features(
-    params: Params, layout: Layout, state: State, known: _Known, count: Float[Array, ""]
+    params: Params, layout: Layout, state: State, derived: _Derived, count: Float[Array, ""]
 ) -> dict[str, Array]:
     """Return the features of the data ages and of their deadlines."""
-    disconnected, expiry = ~layout.has_comms, known.expiry
+    disconnected, expiry = ~layout.has_comms, derived.expiry
     deadline = _deadlines(params, layout, state.age)
-    load = demand.load_by_deadline(deadline, known.visit_share)
+    load = demand.load_by_deadline(deadline, derived.visit_share)
     return {
         "lacks_comms": disconnected,
         "age": _counted_age(layout, state) / expiry,
@@ -189,42 +194,42 @@ def _age_features(
 
 
 def _visit_features(
-    params: Params, layout: Layout, state: State, known: _Known, mask: Bool[Array, " n"]
+    params: Params, layout: Layout, state: State, derived: _Derived, mask: Bool[Array, " n"]
 ) -> dict[str, Array]:
     """Return what a visit to each device takes and whom it serves."""
-    duration = known.mean.duration
+    duration = derived.mean.duration
     t_fly = jnp.linalg.norm(layout.position - state.uav_position, axis=-1) / params.uav_speed_m_s
     base, extra = demand.flight_power(params)
-    served = known.covers & (~layout.has_power | ~layout.has_comms)
-    oldest = jnp.max(jnp.where(known.covers, _counted_age(layout, state), 0.0), axis=1)
+    served = derived.covers & (~layout.has_power | ~layout.has_comms)
+    oldest = jnp.max(jnp.where(derived.covers, _counted_age(layout, state), 0.0), axis=1)
     return {
         "flight": jnp.minimum(t_fly / jnp.maximum(duration, 1e-3), 2.0),
         "here": t_fly <= 0.0,
         "together": jnp.sum(served, axis=1) / 4.0,
-        "oldest_served": oldest / known.expiry,
+        "oldest_served": oldest / derived.expiry,
         "slot_length": duration / jnp.maximum(jnp.max(jnp.where(mask, duration, 0.0)), 1e-3),
         "uav_use": jnp.minimum((base * duration + extra * t_fly) / jnp.maximum(state.uav_energy, 1.0), 1.0),
     }
 
 
 def _after_visit_features(
-    params: Params, layout: Layout, state: State, known: _Known, slots: Float[Array, ""]
+    params: Params, layout: Layout, state: State, derived: _Derived, slots: Float[Array, ""]
 ) -> dict[str, Array]:
     """Return how many slots are to spare, and how tight the tightest deadline is, after a visit to each device."""
-    battery = state.battery - known.use
-    age = jnp.where(known.covers, 0, state.age + jnp.where(layout.has_comms, 0, 1))
+    battery = state.battery - derived.use
+    age = jnp.where(derived.covers, 0, state.age + jnp.where(layout.has_comms, 0, 1))
     remaining = jnp.maximum(slots - 1.0, 1.0)
-    saving = jnp.maximum(known.mean.work - known.mean.upload, 1e-3)
-    missing = (remaining * known.drain - battery) / saving
+    saving = jnp.maximum(derived.mean.work - derived.mean.upload, 1e-3)
+    missing = (remaining * derived.drain - battery) / saving
     services = jnp.where(layout.has_power, 0.0, jnp.maximum(missing, 0.0))
     age_visits, _ = demand.age_visits(params, layout, age, remaining)
-    spare = remaining - order_independent_sum(jnp.maximum(services, age_visits) * known.visit_share)
+    spare = remaining - order_independent_sum(jnp.maximum(services, age_visits) * derived.visit_share)
     deadline = _deadlines(params, layout, age)
-    load = demand.load_by_deadline(deadline, known.visit_share)
+    load = demand.load_by_deadline(deadline, derived.visit_share)
     crowding = jnp.max(jnp.where(deadline < demand.NEVER, load - deadline, _NO_CROWDING), axis=-1)
     return {
         "spare_after": jnp.clip(spare / 8.0, -2.0, 2.0),
-        "crowding_after": jnp.clip(crowding / known.expiry, -2.0, 2.0),
+        "crowding_after": jnp.clip(crowding / derived.expiry, -2.0, 2.0),
         "on_time_after": crowding <= 0.0,
     }
 
@@ -233,19 +238,19 @@ def _shared_features(
     params: Params,
     layout: Layout,
     state: State,
-    known: _Known,
+    derived: _Derived,
     slots: Float[Array, ""],
     services: Float[Array, " n"],
     count: Float[Array, ""],
 ) -> dict[str, Array]:
     """Return the features that are the same for all devices."""
     base, _ = demand.flight_power(params)
-    uav_slots = state.uav_energy / jnp.maximum(base * jnp.min(known.mean.duration), 1e-3)
+    uav_slots = state.uav_energy / jnp.maximum(base * jnp.min(derived.mean.duration), 1e-3)
     age_visits, _ = demand.age_visits(params, layout, state.age, slots)
-    needed = order_independent_sum(jnp.maximum(services, age_visits) * known.visit_share)
+    needed = order_independent_sum(jnp.maximum(services, age_visits) * derived.visit_share)
     deadline = _deadlines(params, layout, state.age)
     falls_due = deadline <= slots
-    load = demand.load_by_deadline(jnp.where(falls_due, deadline, demand.NEVER), known.visit_share)
+    load = demand.load_by_deadline(jnp.where(falls_due, deadline, demand.NEVER), derived.visit_share)
     return {
         "hoped": slots / _LIFETIME_SCALE,
         "uav_life": jnp.minimum(uav_slots / _LIFETIME_SCALE, 2.0),
