@@ -81,14 +81,14 @@ def test_a_cut_off_episode_is_bootstrapped():
     )
     state = actor_critic.init(spec, a2c._OPTIMIZER, limited)
     collect = over_agents(functools.partial(collect_rollout, spec), 0, 0, 0)
-    _, cut = take(collect(*stack([(limited, state, jax.random.key(5))])), 0)
-    _, whole = take(collect(*stack([(free, state, jax.random.key(5))])), 0)
+    _, truncated = take(collect(*stack([(limited, state, jax.random.key(5))])), 0)
+    _, full = take(collect(*stack([(free, state, jax.random.key(5))])), 0)
     # the first slot is the same for both; the state it led to is what the free one observes next
-    values = np.asarray(actor_critic.value(spec, limited.hyper, state.weights, whole.observation[:2]))
-    assert_array_equal(cut.observation[0], whole.observation[0])
-    # returns: r + gamma V(s') when cut; r + gamma (second slot's return) when free
-    difference = whole.returns[0] - cut.returns[0]
-    assert_allclose(difference, 0.5 * (whole.returns[1] - values[1]), rtol=1e-4)
+    values = np.asarray(actor_critic.value(spec, limited.hyper, state.weights, full.observation[:2]))
+    assert_array_equal(truncated.observation[0], full.observation[0])
+    # returns: r + gamma V(s') when truncated; r + gamma (second slot's return) when free
+    difference = full.returns[0] - truncated.returns[0]
+    assert_allclose(difference, 0.5 * (full.returns[1] - values[1]), rtol=1e-4)
 
 
 @pytest.mark.slow

@@ -45,7 +45,7 @@ def test_a_sweep_over_learning_rates(scenarios):
         ({"algorithm": "dqnn"}, "algorithm is 'dqnn'; did you mean 'dqn'"),
         (
             {"hyper": {"learning_rat": 1}},
-            "hyper has 'learning_rat', which is not one of dqn; did you mean 'learning_rate'",
+            "hyper has 'learning_rat', which is not a hyperparameter of dqn; did you mean 'learning_rate'",
         ),
         ({"hyper": {"gamma": [0.9, 0.8]}}, r"hyper.gamma has shape \(2,\); give one number or 3 of them"),
         ({"settings": {"batchsize": 3}}, "settings has 'batchsize'; did you mean 'batch_size'"),

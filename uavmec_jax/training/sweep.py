@@ -137,7 +137,7 @@ def _batch_hyper(algorithm: str, registered: RegisteredAlgorithm, hyper: Mapping
     for name in hyper:
         if name not in registered.traced:
             hint = suggest(name, registered.traced)
-            raise StudyError(f"hyper has {name!r}, which is not one of {algorithm}; {hint}")
+            raise StudyError(f"hyper has {name!r}, which is not a hyperparameter of {algorithm}; {hint}")
     leaves = {}
     for name, default in vars(registered.hyper()).items():
         value = jnp.asarray(hyper.get(name, default), leaf_dtype(default))
