@@ -134,6 +134,8 @@ def test_the_price_of_a_failure_counts(scenario):
     priced_layout = layout.replace(traffic=Traffic(weight, jnp.float32(jnp.inf), jnp.float32(50.0)))
     priced = advise(POLICY, params, priced_layout, state, samples=SAMPLES)
     price = 50.0 * np.asarray(weight[0])
-    value = [one.lifetimes.mean() - one.first_failure @ price for one in (free.forecast, priced.forecast)]
+    value = [
+        forecast.lifetimes.mean() - forecast.first_failure @ price for forecast in (free.forecast, priced.forecast)
+    ]
     assert value[1] >= value[0] - 1e-3
     assert all(candidate.behind >= -1e-3 for candidate in priced.candidates)

@@ -68,22 +68,22 @@ def test_no_failure_is_not_negative():
 def test_make_forecast_summarises_rollouts():
     params, layout, _ = mid_life(2, 6)
     futures = jax.random.split(jax.random.key(7), 32)
-    made = make_forecast(POLICY, params, layout, key=jax.random.key(7), samples=32)
+    result = make_forecast(POLICY, params, layout, key=jax.random.key(7), samples=32)
     simulated = Forecast.of(jax.jit(lambda: rollouts(POLICY, params, layout, futures))())
-    chex.assert_trees_all_close(vars(made), vars(simulated), rtol=1e-6)
+    chex.assert_trees_all_close(vars(result), vars(simulated), rtol=1e-6)
 
 
 def test_make_forecast_starts_from_the_present_state():
     params, layout, state = mid_life(2, 6)
-    made = make_forecast(POLICY, params, layout, state, samples=8)
+    result = make_forecast(POLICY, params, layout, state, samples=8)
     futures = jax.random.split(jax.random.key(0), 8)
     simulate = jax.jit(jax.vmap(lambda future: rollout_from(POLICY, params, layout, state, future).length))
-    assert_array_equal(made.lifetimes, simulate(futures))
-    assert made.lifetimes.min() > int(state.slot)
+    assert_array_equal(result.lifetimes, simulate(futures))
+    assert result.lifetimes.min() > int(state.slot)
 
 
 def test_a_forecast_has_256_futures_by_default():
     params, layout, state = mid_life(2, 6)
-    made, again = (make_forecast(POLICY, params, layout, state) for _ in range(2))
-    assert len(made.lifetimes) == SAMPLES == 256
-    assert_array_equal(made.lifetimes, again.lifetimes)
+    first, again = (make_forecast(POLICY, params, layout, state) for _ in range(2))
+    assert len(first.lifetimes) == SAMPLES == 256
+    assert_array_equal(first.lifetimes, again.lifetimes)

@@ -1,4 +1,4 @@
-"""Policies that learn nothing, and certificates: heuristics, planners, upper bounds, forecasts, the full observation."""
+"""Decisions without learning: heuristics, planners, certified upper bounds, forecasts, and the full observation."""
 
 import lazy_loader
 

@@ -116,7 +116,8 @@ def upper_bounds(
         _Instance(**{name: leaf[b] if leaf.ndim > 1 else leaf[b].item() for name, leaf in batch.items()})
         for b in range(len(reached))
     )
-    return np.array([_bound(one, int(lifetime)) for one, lifetime in zip(instances, reached, strict=True)], np.int32)
+    bounds = [_bound(instance, int(low)) for instance, low in zip(instances, reached, strict=True)]
+    return np.array(bounds, np.int32)
 
 
 def _bound(instance: _Instance, low: int) -> int:

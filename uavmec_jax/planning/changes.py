@@ -9,6 +9,7 @@ from jaxtyping import Int
 from uavmec_jax.env.layout import Layout
 
 CHANGES = ("repair power", "repair comms", "remove")
+"""Names of the changes, in the order of :func:`every_change`."""
 
 
 @dataclass(frozen=True)

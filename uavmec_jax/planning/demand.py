@@ -54,8 +54,8 @@ def _slant(params: Params, layout: Layout) -> Float[Array, "n n"]:
 def visit_shares(layout: Layout, covers: Bool[Array, "n n"]) -> Float[Array, " n"]:
     """Return the share of a visit that each device accounts for, such that no slot is worth more than one visit.
 
-    The share of a needy device is one over the largest number of needy devices at any hover point that covers it: 1 if it
-    never shares a hover point with another needy device. Devices with power and communication have share 0.
+    The share of a needy device is the reciprocal of the largest number of needy devices that a hover point covering it
+    covers: 1 if no hover point covers it together with another needy device. Other devices have share 0.
 
     Wherever the UAV hovers, the shares of the devices served sum to at most 1. The shares are thus a feasible solution of
     the dual of the covering problem "choose hover points so that every device is covered as often as it needs", and by

@@ -83,7 +83,7 @@ class Observation:
 
 
 def observe_devices(params: Params, layout: Layout, state: State) -> Observation:
-    """Return the full observation of a state: what is known before the slot's task volumes are.
+    """Return the full observation of a state before the slot.
 
     Args:
         params: scenario parameters.
@@ -196,7 +196,7 @@ def _age_features(
 def _visit_features(
     params: Params, layout: Layout, state: State, derived: _Derived, mask: Bool[Array, " n"]
 ) -> dict[str, Array]:
-    """Return what a visit to each device takes and whom it serves."""
+    """Return what a visit to each device costs and which devices it serves."""
     duration = derived.mean.duration
     t_fly = jnp.linalg.norm(layout.position - state.uav_position, axis=-1) / params.uav_speed_m_s
     base, extra = demand.flight_power(params)

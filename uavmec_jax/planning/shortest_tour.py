@@ -26,8 +26,8 @@ def nearest_neighbour(position: Float[Array, "n 2"], needy: Bool[Array, " n"]) -
     """Return the order that starts at the origin and always visits the nearest remaining needy device; the rest follow."""
 
     def visit(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], Array]:
-        place, remaining = carry
-        distance = jnp.linalg.norm(position - place, axis=-1)
+        here, remaining = carry
+        distance = jnp.linalg.norm(position - here, axis=-1)
         nearest = jnp.argmin(jnp.where(remaining, distance, jnp.where(jnp.any(remaining), jnp.inf, 0.0)))
         return (position[nearest], remaining.at[nearest].set(False)), nearest
 
