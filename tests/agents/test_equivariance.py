@@ -1,5 +1,7 @@
 """The permutation-equivariant networks: any number of devices, in any order, with padding."""
 
+import functools
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -16,14 +18,22 @@ from uavmec_jax.env.layout import pad_layout
 from uavmec_jax.planning.observation import FEATURES, observe_devices
 
 SPEC = ppo.PPOSpec(hidden=(16, 24), observation="full", n_envs=4, n_steps=8, batch_size=16)
-WEIGHTS = SPEC.network.init(jax.random.key(3), jnp.zeros((1, SPEC.obs_size)))
+
+
+@functools.cache
+def initial_weights():
+    return SPEC.network.init(jax.random.key(3), jnp.zeros((1, SPEC.obs_size)))
+
+
+def logits_and_value(params, layout, state):
+    """Return the logits and the value of one state."""
+    return apply_network(initial_weights(), params, layout, state)
 
 
 @jax.jit
-def logits_and_value(params, layout, state):
-    """Logits and value of one state."""
+def apply_network(weights, params, layout, state):
     observation = OBSERVATIONS["full"].observation_fn(params, layout, state)
-    logits, value = SPEC.network.apply(WEIGHTS, observation[None])
+    logits, value = SPEC.network.apply(weights, observation[None])
     return logits[0], value[0]
 
 
