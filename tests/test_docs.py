@@ -80,7 +80,12 @@ def execute(page, chosen, folder, monkeypatch):
         exec(compile(code, str(ROOT / page), "exec"), namespace)
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if not all(block.full for block in blocks(page, "python"))])
+def mark(page):
+    """Mark the pages whose code compiles for long; the README's always runs."""
+    return pytest.param(page, marks=() if page == "README.md" else pytest.mark.slow)
+
+
+@pytest.mark.parametrize("page", [mark(page) for page in PAGES if not all(b.full for b in blocks(page, "python"))])
 def test_code_runs(page, tmp_path, monkeypatch):
     execute(page, [block for block in blocks(page, "python") if not block.full], tmp_path, monkeypatch)
 

@@ -15,6 +15,8 @@ from jaxtyping import AbstractArray, TypeCheckError, jaxtyped
 
 _CONF = BeartypeConf(is_pep484_tower=True)  # an int is accepted where a float is asked for
 _LEAVES = (jax.Array, np.ndarray, np.generic, int, float)
+_passed: set[tuple] = set()
+"""Signatures of pytrees that passed the check."""
 
 
 def checked(function):
@@ -44,11 +46,13 @@ def check_fields(tree: Any) -> None:
     """
     if _is_pytree(type(tree)):
         types = _field_types(type(tree))
-        children = {name: getattr(tree, name) for name in types}
-        with jaxtyped("context"):
-            for name, annotation in types.items():
-                _check_leaf(f"{type(tree).__name__}.{name}", children[name], annotation)
-        children = children.values()
+        children = [getattr(tree, name) for name in types]
+        signature = (type(tree), *map(_leaf_signature, children))
+        if signature not in _passed:
+            with jaxtyped("context"):
+                for (name, annotation), child in zip(types.items(), children, strict=True):
+                    _check_leaf(f"{type(tree).__name__}.{name}", child, annotation)
+            _passed.add(signature)
     elif isinstance(tree, tuple | list):
         children = tree
     elif isinstance(tree, dict):
@@ -57,6 +61,13 @@ def check_fields(tree: Any) -> None:
         return
     for child in children:
         check_fields(child)
+
+
+def _leaf_signature(value: Any) -> tuple | None:
+    """Return all that the check of a field depends on; ``None`` for what it does not look at."""
+    if not isinstance(value, _LEAVES):
+        return None
+    return isinstance(value, jax.Array), getattr(value, "shape", None), getattr(value, "dtype", type(value))
 
 
 def _check_leaf(name: str, value: Any, annotation: Any) -> None:

@@ -156,6 +156,7 @@ def test_update_against_numpy(jit, max_grad_norm):
             assert_allclose(after.weights["params"][f"TorchDense_{i}"][name], expected, rtol=1e-4, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_same_seed_is_bit_equal_and_seeds_differ():
     agents = stack([make_agent(0), make_agent(0), make_agent(1)])
     state, again = train(SPEC, agents, 0, 300), train(SPEC, agents, 0, 300)

@@ -98,6 +98,7 @@ def test_without_traffic_nothing_changes():
     assert_allclose(rewards[0], 1 + np.log(1e-6) - np.log(1e-6))
 
 
+@pytest.mark.slow
 def test_returns_are_sums_over_the_same_episodes():
     layout = three_devices(traffic=STATIC)
     policy = tour_policy(jnp.array([0, 2, 1] * 40))

@@ -47,6 +47,7 @@ def test_nothing_exceeds_the_bound_on_small_instances(first_seed):
         assert max(lifetimes.values()) <= optimum, (seed, lifetimes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("powered", "connected"), [(12, 4), (4, 4)])
 def test_no_policy_exceeds_the_bound_at_the_papers_settings(powered, connected):
     params = traced(Params())

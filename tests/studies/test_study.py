@@ -62,6 +62,7 @@ def test_population_is_the_product_of_the_axes():
     chex.assert_tree_shape_prefix(agents, (24,))
 
 
+@pytest.mark.slow
 def test_an_agent_does_not_depend_on_the_other_agents():
     few, many = parse_study(SMALL, "x"), parse_study(SMALL, "x", {"axes.powered": [12, 8, 4], "axes.seeds": [7, 1]})
     all_few, all_many = make_agent_ids(few), make_agent_ids(many)

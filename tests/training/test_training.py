@@ -117,6 +117,7 @@ def test_all_shards_share_one_compilation(population):
     assert any(differs(first.last, second.last))
 
 
+@pytest.mark.slow
 def test_regrouping_keeps_each_agent_and_compiles_nothing_twice(population):
     with compilations() as compiled:
         trainer = Trainer.compile(traced_at_most_once(ALGORITHM), *take(population, slice(4)), VALIDATION, PARTITION)
