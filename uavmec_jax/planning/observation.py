@@ -146,6 +146,7 @@ class _Derived(NamedTuple):
             # In steps of 2**-16 the sums of shares are exact, so they do not depend on the order of the devices.
             visit_share=jnp.floor(demand.visit_shares(layout, covers) * 65536.0) / 65536.0,
             drain=demand.idle_drain(layout, mean),
+            # One value for all features: XLA divides by several copies of it with different last bits.
             expiry=jnp.maximum(slots_to_expiry(params), 1).astype(jnp.float32),
             use=use,
         )
