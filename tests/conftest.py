@@ -3,6 +3,7 @@
 import os
 import sys
 import tempfile
+from importlib.metadata import version
 
 # A program is compiled once per session, whichever worker, test or subprocess needs it: the first process makes the cache
 # folder, the others inherit its name. Several sessions share their cache if the variable is set before they start.
@@ -10,6 +11,13 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     _cache = tempfile.TemporaryDirectory(prefix="uavmec-jax-tests-")
     os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache.name
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.05"
+
+# The tests compile for longer than they run, so machine code that is made quickly will do. Those that compare two computations
+# to the bit also run with the usual machine code: XLA_FLAGS= pytest -m bits.
+_flags = "--xla_backend_optimization_level=1"
+if version("jaxlib").startswith("0.10."):  # XLA ends the process if it does not know a flag
+    _flags += " --xla_cpu_use_fusion_emitters=false"
+os.environ.setdefault("XLA_FLAGS", _flags)
 
 # The tests start about a hundred processes. If Python may not write bytecode beside the sources, each of them would compile
 # its imports again, which takes seconds, so bytecode goes to a folder that is removed with the session.
