@@ -15,8 +15,10 @@ os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.05"
 # The tests compile for longer than they run, so machine code that is made quickly will do. Those that compare two
 # computations to the bit also run with the usual machine code: XLA_FLAGS= pytest -m bits. XLA ends the process if it does not
 # know a flag, and only jaxlib 0.10 is sure to know the second one.
-_flags = ("--xla_backend_optimization_level=1", "--xla_cpu_use_fusion_emitters=false")
-os.environ.setdefault("XLA_FLAGS", " ".join(_flags[: 1 + version("jaxlib").startswith("0.10.")]))
+if "XLA_FLAGS" not in os.environ:
+    os.environ["XLA_FLAGS"] = "--xla_backend_optimization_level=1"
+    if version("jaxlib").startswith("0.10."):
+        os.environ["XLA_FLAGS"] += " --xla_cpu_use_fusion_emitters=false"
 
 # The tests start about a hundred processes. If Python may not write bytecode beside the sources, each of them would compile
 # its imports again, which takes seconds, so bytecode goes to a folder that is removed with the session.
