@@ -1,0 +1,174 @@
+"""Turn the tables of a scenario file into arrays: devices, depots and UAVs."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from uavmec_jax.env import hardware
+from uavmec_jax.env.fleet import (
+    DEPOT_POWER_W,
+    MAX_UAVS,
+    UAV_FIELDS,
+    DepotKind,
+    Depots,
+    Fleet,
+    make_depots,
+    make_fleet,
+)
+from uavmec_jax.env.layout import Layout
+from uavmec_jax.env.params import MAX_DEVICES, Params
+from uavmec_jax.files.validation import suggest
+from uavmec_jax.scenarios.region import Positions
+from uavmec_jax.scenarios.schema import Device, ScenarioFile, label
+
+UNLISTED = -1
+"""``device_type`` and ``task`` of hardware that the paper's tables do not list."""
+
+_HARDWARE_FIELDS = ("standby_power_w", "active_power_w", "processing_rate_bytes_s")
+
+
+def check_inventory(file: ScenarioFile) -> None:
+    """Check the numbers of tables and their names, and the settings that only some kinds of depots have.
+
+    Raises:
+        ValueError: one line that names the table.
+    """
+    if not 1 <= len(file.device) <= MAX_DEVICES:
+        raise ValueError(f"holds {len(file.device)} devices; give 1 to {MAX_DEVICES} [[device]] tables or lines")
+    for table, most in (("depot", MAX_DEVICES), ("uav", MAX_UAVS)):
+        if (count := len(getattr(file, table))) > most:
+            raise ValueError(f"holds {count} [[{table}]] tables; give at most {most}")
+    places = [("device", number, name) for number, name in enumerate(file.device_names, 1)]
+    _check_names(places + [("depot", number, name) for number, name in enumerate(file.depot_names, 1)])
+    _check_names([("uav", number, name) for number, name in enumerate(file.uav_names, 1)])
+    if all(device.priority == 0 for device in file.device):
+        raise ValueError("priority is 0 for all devices; give at least one of them more")
+    for number, depot in enumerate(file.depot, 1):
+        field, does, other = ("power_w", "swaps", "charge") if depot.kind == "swap" else ("packs", "charges", "swap")
+        if (value := getattr(depot, field)) is not None:
+            raise ValueError(
+                f"{label('depot', number, depot.name)}: {field} is {value:g}, but it {does} batteries; leave {field} out, "
+                f'or give kind = "{other}"'
+            )
+
+
+def _check_names(named: Sequence[tuple[str, int, str]]) -> None:
+    """Check that no two of the tables have the same name."""
+    seen: dict[str, str] = {}
+    for table, number, name in named:
+        if name in seen:
+            which = "another" if seen[name] == table else "a"
+            raise ValueError(f"{table} {number}: name is {name!r}, which {which} {seen[name]} has; names must differ")
+        seen[name] = table
+
+
+def build_layout(file: ScenarioFile, params: Params, positions: Positions) -> Layout:
+    """Return the devices, the depots and the UAVs as arrays; ``None`` for what the file leaves out.
+
+    Raises:
+        ValueError: the hardware of a device is unknown; one line.
+    """
+    devices = file.device
+    powers = np.array([_hardware(number, device) for number, device in enumerate(devices, 1)])
+    priority = None
+    if any(device.priority is not None for device in devices):
+        priority = jnp.asarray([1.0 if it.priority is None else it.priority for it in devices], jnp.float32)
+    depots = _depots(file, positions)
+    return Layout(
+        position=jnp.asarray(positions.devices, jnp.float32),
+        device_type=jnp.asarray([_index(device.type, hardware.DEVICE_TYPES) for device in devices], jnp.int32),
+        task=jnp.asarray([_index(device.task, hardware.TASKS) for device in devices], jnp.int32),
+        capacity=jnp.asarray([device.capacity_j for device in devices], jnp.float32),
+        has_power=jnp.asarray([device.power for device in devices]),
+        has_comms=jnp.asarray([device.comms for device in devices]),
+        standby_power=jnp.asarray(powers[:, 0], jnp.float32),
+        active_power=jnp.asarray(powers[:, 1], jnp.float32),
+        processing_rate=jnp.asarray(powers[:, 2], jnp.float32),
+        priority=priority,
+        fleet=_fleet(file, params, positions),
+        depots=depots,
+    )
+
+
+def _depots(file: ScenarioFile, positions: Positions) -> Depots | None:
+    """Return the depots, ``None`` without tables."""
+    if not file.depot:
+        return None
+    numbers: dict[str, Any] = {
+        field: [default if (value := getattr(depot, field)) is None else value for depot in file.depot]
+        for field, default in (("pads", np.inf), ("packs", np.inf), ("power_w", DEPOT_POWER_W))
+    }
+    return make_depots(positions.depots, [depot.kind for depot in file.depot], **numbers)
+
+
+def _fleet(file: ScenarioFile, params: Params, positions: Positions) -> Fleet | None:
+    """Return the UAVs, ``None`` without tables."""
+    if not file.uav:
+        return None
+    numbers: dict[str, Any] = {
+        field: [
+            getattr(params, f"uav_{field}") if (value := getattr(uav, field)) is None else value for uav in file.uav
+        ]
+        for field in UAV_FIELDS
+    }
+    return make_fleet(params, len(file.uav), start_m=positions.starts, **numbers)
+
+
+def depot_tables(depots: Depots | None) -> list[dict[str, Any]]:
+    """Return depots, leaves ``[D]`` as NumPy arrays, as the tables of a scenario file; padding is left out."""
+    if depots is None:
+        return []
+    tables = []
+    for d in np.flatnonzero(depots.pads >= 1):
+        table = {"x_m": float(depots.position[d, 0]), "y_m": float(depots.position[d, 1])}
+        swaps = depots.kind[d] == DepotKind.SWAP
+        stock = ("packs", np.inf) if swaps else ("power_w", DEPOT_POWER_W)
+        for field, default in (("pads", np.inf), stock):
+            if (value := float(getattr(depots, field)[d])) != default:
+                table[field] = value
+        tables.append(table | ({} if swaps else {"kind": "charge"}))
+    return tables
+
+
+def uav_tables(fleet: Fleet | None, params: Params) -> list[dict[str, Any]]:
+    """Return UAVs, leaves ``[K]`` as NumPy arrays, as the tables of a scenario file; padding is left out."""
+    if fleet is None:
+        return []
+    tables = []
+    for v in range(len(fleet.speed_m_s)) if fleet.present is None else np.flatnonzero(fleet.present):
+        table = {"x_m": float(fleet.start_m[v, 0]), "y_m": float(fleet.start_m[v, 1])}
+        for field in UAV_FIELDS:
+            if (value := getattr(fleet, field)[v]) != np.float32(getattr(params, f"uav_{field}")):
+                table[field] = float(value)
+        tables.append(table)
+    return tables
+
+
+def _index(name: str | None, names: tuple[str, ...]) -> int:
+    """Return the index of a name in the paper's tables."""
+    return names.index(name) if name in names else UNLISTED
+
+
+def _hardware(number: int, device: Device) -> tuple[float, float, float]:
+    """Return standby power, active power and processing rate: the given ones, else those of the paper's tables."""
+    given = [getattr(device, field) for field in _HARDWARE_FIELDS]
+    for field, names in (("type", hardware.DEVICE_TYPES), ("task", hardware.TASKS)):
+        name = getattr(device, field)
+        needed = given if field == "type" else given[1:]  # the standby power depends on the type alone
+        if name not in names and None in needed:
+            problem = f"is {name!r}, which the tables do not list; {suggest(name, names)}" if name else "is missing"
+            raise ValueError(
+                f"{label('device', number, device.name)}: {field} {problem}; or give {', '.join(_HARDWARE_FIELDS)}"
+            )
+    kind, task = _index(device.type, hardware.DEVICE_TYPES), _index(device.task, hardware.TASKS)
+    listed = (
+        hardware.STANDBY_POWER_W[kind],
+        hardware.ACTIVE_POWER_W[task, kind],
+        hardware.PROCESSING_RATE_BYTES_S[task, kind],
+    )
+    standby, active, rate = (
+        float(table if value is None else value) for value, table in zip(given, listed, strict=True)
+    )
+    return standby, active, rate
