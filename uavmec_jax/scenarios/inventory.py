@@ -5,6 +5,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int
 
 from uavmec_jax.env import hardware
 from uavmec_jax.env.fleet import (
@@ -121,29 +122,49 @@ def depot_tables(depots: Depots | None) -> list[dict[str, Any]]:
     if depots is None:
         return []
     tables = []
-    for d in np.flatnonzero(depots.pads >= 1):
-        table = {"x_m": float(depots.position[d, 0]), "y_m": float(depots.position[d, 1])}
-        swaps = depots.kind[d] == DepotKind.SWAP
-        stock = ("packs", np.inf) if swaps else ("power_w", DEPOT_POWER_W)
-        for field, default in (("pads", np.inf), stock):
+    for number, d in enumerate(np.flatnonzero(depots.pads >= 1), 1):
+        swaps = bool(depots.kind[d] == DepotKind.SWAP)
+        table = _named(f"depot {number}", depots.position[d]) | {"kind": "swap" if swaps else "charge"}
+        for field, default in (("pads", np.inf), ("packs", np.inf) if swaps else ("power_w", DEPOT_POWER_W)):
             if (value := float(getattr(depots, field)[d])) != default:
                 table[field] = value
-        tables.append(table | ({} if swaps else {"kind": "charge"}))
+        tables.append(table)
     return tables
 
 
-def uav_tables(fleet: Fleet | None, params: Params) -> list[dict[str, Any]]:
-    """Return UAVs, leaves ``[K]`` as NumPy arrays, as the tables of a scenario file; padding is left out."""
+def uav_tables(fleet: Fleet | None, params: Params, depots: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return UAVs, leaves ``[K]`` as NumPy arrays, as the tables of a scenario file that has these depots.
+
+    Padding is left out.
+    """
     if fleet is None:
         return []
+    positions = np.array([[depot["x_m"], depot["y_m"]] for depot in depots]).reshape(-1, 2)
     tables = []
-    for v in range(len(fleet.speed_m_s)) if fleet.present is None else np.flatnonzero(fleet.present):
-        table = {"x_m": float(fleet.start_m[v, 0]), "y_m": float(fleet.start_m[v, 1])}
+    for number, v in enumerate(_present(fleet), 1):
+        table = _named(f"uav {number}", fleet.start_m[v])
+        if (depot := place_at(fleet.start_m[v], positions, [it["name"] for it in depots])) is not None:
+            table = {"name": table["name"], "at": depot}
         for field in UAV_FIELDS:
             if (value := getattr(fleet, field)[v]) != np.float32(getattr(params, f"uav_{field}")):
                 table[field] = float(value)
         tables.append(table)
     return tables
+
+
+def _present(fleet: Fleet) -> Int[np.ndarray, " m"]:
+    """Return the numbers of the UAVs that are not padding."""
+    return np.arange(len(fleet.speed_m_s)) if fleet.present is None else np.flatnonzero(fleet.present)
+
+
+def _named(name: str, position: Float[np.ndarray, "2"]) -> dict[str, Any]:
+    return {"name": name, "x_m": float(position[0]), "y_m": float(position[1])}
+
+
+def place_at(position: Float[np.ndarray, "2"], places: Float[np.ndarray, "m 2"], names: Sequence[str]) -> str | None:
+    """Return the name of the last of the places that are exactly at a position; ``None`` if none is."""
+    at = np.flatnonzero(np.all(places == position, axis=1))
+    return names[at[-1]] if at.size else None
 
 
 def _index(name: str | None, names: tuple[str, ...]) -> int:

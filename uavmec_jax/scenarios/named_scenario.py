@@ -170,5 +170,6 @@ def name_scenario(
         }
         for i, device_name in enumerate(names)
     ]
-    tables = {"device": devices, "depot": depot_tables(arrays.depots), "uav": uav_tables(arrays.fleet, params)}
+    depots = depot_tables(arrays.depots)
+    tables = {"device": devices, "depot": depots, "uav": uav_tables(arrays.fleet, params, depots)}
     return make_named_scenario({"name": name, "params": changed} | tables, name)

@@ -10,6 +10,7 @@ from pydantic import Field
 from uavmec_jax.env.fleet import DepotKind
 from uavmec_jax.env.layout import fleet_of
 from uavmec_jax.files.validation import StrictModel, from_array
+from uavmec_jax.scenarios.inventory import place_at
 from uavmec_jax.scenarios.named_scenario import NamedScenario
 from uavmec_jax.scenarios.schema import label
 
@@ -182,7 +183,8 @@ def uav_data(scenario: NamedScenario, number: Callable[[Any], float]) -> dict[st
     """
     state, packs = scenario.state, np.asarray(scenario.state.packs)
     positions = np.asarray(state.uav_position)
-    where = [_place_of(position, scenario) for position in positions]
+    places = np.asarray(scenario.layout.places())
+    where = [place_at(position, places, scenario.place_names) for position in positions]
     return {
         "uavs": {
             name: ({"position_m": [number(x) for x in positions[v]]} if where[v] is None else {"at": where[v]})
@@ -193,9 +195,3 @@ def uav_data(scenario: NamedScenario, number: Callable[[Any], float]) -> dict[st
             name: number(left) for name, left in zip(scenario.depot_names, packs, strict=True) if np.isfinite(left)
         },
     }
-
-
-def _place_of(position: Float[np.ndarray, "2"], scenario: NamedScenario) -> str | None:
-    """Return the name of the place that a UAV is exactly at, a depot before a device; ``None`` if it is at none."""
-    at = np.flatnonzero(np.all(np.asarray(scenario.layout.places()) == position, axis=1))
-    return scenario.place_names[at[np.argmax(at >= len(scenario.device_names))]] if at.size else None
