@@ -121,10 +121,10 @@ def depot_tables(depots: Depots | None) -> list[dict[str, Any]]:
     """Return depots, leaves ``[D]`` as NumPy arrays, as the tables of a scenario file; padding is left out."""
     if depots is None:
         return []
-    tables = []
+    tables, positions = [], np.asarray(depots.position)
     for number, d in enumerate(np.flatnonzero(depots.pads >= 1), 1):
         swaps = bool(depots.kind[d] == DepotKind.SWAP)
-        table = _named(f"depot {number}", depots.position[d]) | {"kind": "swap" if swaps else "charge"}
+        table = _named(f"depot {number}", positions[d]) | {"kind": "swap" if swaps else "charge"}
         for field, default in (("pads", np.inf), ("packs", np.inf) if swaps else ("power_w", DEPOT_POWER_W)):
             if (value := float(getattr(depots, field)[d])) != default:
                 table[field] = value
@@ -140,10 +140,10 @@ def uav_tables(fleet: Fleet | None, params: Params, depots: list[dict[str, Any]]
     if fleet is None:
         return []
     positions = np.array([[depot["x_m"], depot["y_m"]] for depot in depots]).reshape(-1, 2)
-    tables = []
+    tables, starts = [], np.asarray(fleet.start_m)
     for number, v in enumerate(_present(fleet), 1):
-        table = _named(f"uav {number}", fleet.start_m[v])
-        if (depot := place_at(fleet.start_m[v], positions, [it["name"] for it in depots])) is not None:
+        table = _named(f"uav {number}", starts[v])
+        if (depot := place_at(starts[v], positions, [it["name"] for it in depots])) is not None:
             table = {"name": table["name"], "at": depot}
         for field in UAV_FIELDS:
             if (value := getattr(fleet, field)[v]) != np.float32(getattr(params, f"uav_{field}")):
