@@ -75,7 +75,7 @@ def build_layout(file: ScenarioFile, params: Params, positions: Positions) -> La
     powers = np.array([_hardware(number, device) for number, device in enumerate(devices, 1)])
     priority = None
     if any(device.priority is not None for device in devices):
-        priority = jnp.asarray([1.0 if it.priority is None else it.priority for it in devices], jnp.float32)
+        priority = jnp.asarray(_column(devices, "priority", 1.0))
     depots = _depots(file, positions)
     return Layout(
         position=jnp.asarray(positions.devices, jnp.float32),
@@ -97,8 +97,8 @@ def _depots(file: ScenarioFile, positions: Positions) -> Depots | None:
     """Return the depots, ``None`` without tables."""
     if not file.depot:
         return None
-    numbers: dict[str, Any] = {
-        field: [default if (value := getattr(depot, field)) is None else value for depot in file.depot]
+    numbers = {
+        field: _column(file.depot, field, default)
         for field, default in (("pads", np.inf), ("packs", np.inf), ("power_w", DEPOT_POWER_W))
     }
     return make_depots(positions.depots, [depot.kind for depot in file.depot], **numbers)
@@ -108,13 +108,13 @@ def _fleet(file: ScenarioFile, params: Params, positions: Positions) -> Fleet | 
     """Return the UAVs, ``None`` without tables."""
     if not file.uav:
         return None
-    numbers: dict[str, Any] = {
-        field: [
-            getattr(params, f"uav_{field}") if (value := getattr(uav, field)) is None else value for uav in file.uav
-        ]
-        for field in UAV_FIELDS
-    }
+    numbers: dict[str, Any] = {field: _column(file.uav, field, getattr(params, f"uav_{field}")) for field in UAV_FIELDS}
     return make_fleet(params, len(file.uav), start_m=positions.starts, **numbers)
+
+
+def _column(tables: Sequence[Any], field: str, default: Any) -> Float[np.ndarray, " m"]:
+    """Return one setting of all tables, with the default where it is missing."""
+    return np.array([default if (value := getattr(table, field)) is None else value for table in tables], np.float32)
 
 
 def depot_tables(depots: Depots | None) -> list[dict[str, Any]]:

@@ -159,7 +159,7 @@ def region_sides(positions: Positions) -> tuple[float, float]:
     return float(east), float(north)
 
 
-def _check_polygon(corners: Float[np.ndarray, "m 2"], in_degrees: bool) -> Float[np.ndarray, "m 2"]:
+def _check_polygon(corners: Float[np.ndarray, "given 2"], in_degrees: bool) -> Float[np.ndarray, "m 2"]:
     """Return the corners of a simple polygon, each of them once; the last one may repeat the first."""
     if len(corners) > 1 and np.array_equal(corners[0], corners[-1]):
         corners = corners[:-1]
@@ -215,6 +215,6 @@ def inside_polygon(
     return inside | np.any(distance <= tolerance, axis=1)
 
 
-def _cross(a: Float[np.ndarray, "*s 2"], b: Float[np.ndarray, "*s 2"]) -> Float[np.ndarray, "*s"]:
+def _cross(a: Float[np.ndarray, "*#s 2"], b: Float[np.ndarray, "*#s 2"]) -> Float[np.ndarray, "..."]:
     """Return the cross products of vectors."""
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
