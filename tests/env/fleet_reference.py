@@ -1,9 +1,9 @@
 """One slot of a fleet in plain NumPy, one UAV, device and depot after the other, in double precision.
 
 It is written from the rules and shares nothing with the package but the names of the fields, so the two can be held
-against each other. States and outcomes are dictionaries named like the package's fields. ``outcome["edge"]`` says how close
-the nearest comparison came to going the other way, relative to the numbers compared: below about 1e-5, single precision may
-decide otherwise.
+against each other. States and outcomes are dictionaries named like the package's fields. An outcome also holds what devices
+drained and UAVs paid, J, and its ``edge``: how close the nearest comparison came to going the other way, relative to the
+numbers compared. Below about 1e-5, single precision may decide otherwise.
 """
 
 import math
@@ -34,7 +34,7 @@ class Station:
     """A depot, with the packs it has left."""
 
     position: np.ndarray
-    kind: int
+    kind: float
     pads: float
     packs: float
     power: float
@@ -81,25 +81,11 @@ def read_vehicles(params, layout, state):
     fleet = layout.fleet
     vehicles = []
     for v, (position, energy) in enumerate(zip(positions, energies, strict=True)):
-        if fleet is None:
-            constants = (
-                params.uav_speed_m_s,
-                params.uav_flying_power_w,
-                params.uav_hovering_power_w,
-                params.uav_battery_j,
-                params.uav_signal_range_m,
-            )
-        else:
-            constants = (
-                fleet.speed_m_s[v],
-                fleet.flying_power_w[v],
-                fleet.hovering_power_w[v],
-                fleet.battery_j[v],
-                fleet.signal_range_m[v],
-            )
+        fields = ("speed_m_s", "flying_power_w", "hovering_power_w", "battery_j", "signal_range_m")
+        constants = [getattr(params, f"uav_{name}") if fleet is None else getattr(fleet, name)[v] for name in fields]
         padding = fleet is not None and fleet.present is not None and not fleet.present[v]
         grounded = padding or (state.grounded is not None and bool(np.asarray(state.grounded).reshape(-1)[v]))
-        vehicles.append(Vehicle(*(float(array(one)) for one in constants), position, energy, grounded))
+        vehicles.append(Vehicle(*map(float, constants), position, energy, grounded))
     return vehicles
 
 
@@ -108,11 +94,9 @@ def read_stations(layout, state):
     depots = layout.depots
     if depots is None:
         return []
-    packs = array(depots.packs if state.packs is None else state.packs)
-    return [
-        Station(array(depots.position[d]), int(depots.kind[d]), float(depots.pads[d]), packs[d], float(depots.power_w[d]))
-        for d in range(len(packs))
-    ]
+    left = depots.packs if state.packs is None else state.packs
+    rows = zip(array(depots.position), depots.kind, depots.pads, left, depots.power_w, strict=True)
+    return [Station(position, *map(float, numbers)) for position, *numbers in rows]
 
 
 def present_devices(layout):
@@ -243,6 +227,7 @@ def reference_slot(params, layout, state, action, volumes):
         "first_failure": np.zeros(n),
         "started": np.array([v in flying for v in range(len(vehicles))]),
         "drain": np.zeros(n),
+        "paid": np.zeros(len(vehicles)),
         "edge": edge.nearest,
     }
     waits = {v: station_at(stations, vehicles[v].position) for v in willing if v not in flying}
@@ -261,6 +246,7 @@ def reference_slot(params, layout, state, action, volumes):
     for v in flying:
         after["uav_position"][v] = spots[v]
         after["uav_energy"][v] -= plan.cost[v]
+        outcome["paid"][v] = plan.cost[v]
         if places[v] >= n:
             guests[v] = (station_at(stations, spots[v]), flights[v])
     serve_at_depots(vehicles, stations, guests, after["uav_energy"], plan.duration)

@@ -1,13 +1,13 @@
 """Slots under a horizon, worked by hand: devices fail one by one, and the others go on.
 
-The layout and its numbers are those of test_fleet_rules.py.
+small_fleets.py has the numbers behind them.
 """
 
 import jax.numpy as jnp
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from tests.env.test_fleet_rules import DEVICE_0, DEVICE_1, FULL, HORIZON, ORIGIN, PARAMS, QUICK, SLOW, fleet_layout, play
+from tests.env.small_fleets import DEVICE_0, DEVICE_1, FULL, HORIZON, ORIGIN, PARAMS, QUICK, SLOW, fleet_layout, play
 from uavmec_jax.env.dynamics import Cause
 from uavmec_jax.env.fleet import make_depots
 from uavmec_jax.env.params import Params

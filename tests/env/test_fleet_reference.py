@@ -8,17 +8,25 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from tests.env.fleet_reference import CHARGE, SWAP, reference_slot
+from tests.env.fleet_reference import CHARGE, SWAP, reference_reward_terms, reference_slot
 from uavmec_jax.env import hardware
 from uavmec_jax.env.dynamics import Cause, State, transition
 from uavmec_jax.env.fleet import Depots, Fleet
 from uavmec_jax.env.layout import Layout, mask_absent
 from uavmec_jax.env.params import Params
+from uavmec_jax.env.rewards import make_reward, reward_of
 
 CLOSE = 1e-5
 """Comparisons closer than this may go either way in single precision; such slots are left out and counted."""
 
-step = jax.jit(transition)
+REWARD_TERMS = "AOMUS"
+
+
+@jax.jit
+def play(params, layout, state, action, volumes):
+    after, outcome = transition(params, layout, state, action, volumes)
+    rewards = [make_reward({term: 1.0}) for term in REWARD_TERMS]
+    return after, outcome, [reward_of(one, layout, state, action, after, params) for one in rewards]
 
 
 class Shape(NamedTuple):
@@ -154,7 +162,7 @@ def draw_action(rng, shape):
 
 def compare(params, layout, state, action, volumes):
     """Play one slot in both ways; return the package's state, the reference's outcome and whether the slot was left out."""
-    after, outcome = jax.device_get(step(params, layout, state, action, volumes))
+    after, outcome, terms = jax.device_get(play(params, layout, state, action, volumes))
     expected, reference = reference_slot(params, layout, state, action, volumes)
     if reference["edge"] < CLOSE:
         return after, reference, True
@@ -166,12 +174,15 @@ def compare(params, layout, state, action, volumes):
         assert_array_equal(getattr(after, field), expected[field], err_msg=field)
     assert_allclose(after.elapsed, expected["elapsed"], rtol=1e-5)
     within(after.battery, expected["battery"], state.battery, reference["drain"])
-    within(after.uav_energy, expected["uav_energy"], state.uav_energy, 2e5)
+    charged = expected["uav_energy"] - (np.asarray(state.uav_energy) - reference["paid"])
+    within(after.uav_energy, expected["uav_energy"], state.uav_energy, reference["paid"] + charged)
+    wanted = reference_reward_terms(params, layout, state, action, after)
+    assert_allclose(terms, [wanted[term] for term in REWARD_TERMS], rtol=1e-5, atol=1e-6)
     return after, reference, False
 
 
 def within(value, expected, before, change):
-    """Check an energy: half a dozen roundings of what was there, and a relative error of what was added or taken."""
+    """Check an energy: a few roundings of what there was, and a relative error of what was taken or added."""
     difference = np.abs(value - expected)
     assert np.all(difference <= 3 * np.spacing(floats(before)) + CLOSE * np.asarray(change)), (value, expected)
 
@@ -186,16 +197,19 @@ def play_episodes(shape, episodes, seed=0):
         for _ in range(8):
             action, volumes = draw_action(rng, shape), floats(rng.uniform(2e6, 4e6, shape.devices))
             after, outcome, left_out = compare(params, layout, state, action, volumes)
-            seen.update({"slots": 1, "left out": left_out, Cause(outcome["cause"]).name: 1, **events(state, after, outcome)})
+            seen.update(events(state, after, outcome, left_out))
             if outcome["cause"] != Cause.NONE:
                 break
             state = after
     return seen
 
 
-def events(before, after, outcome):
+def events(before, after, outcome, left_out):
     taken_out = ~before.grounded & ~outcome["started"]
     return {
+        "slots": 1,
+        "left out": left_out,
+        Cause(outcome["cause"]).name: 1,
         "grounded": np.any(after.grounded & ~before.grounded),
         "starts without a neighbour": np.any(taken_out) and np.any(outcome["started"]),
         "waits at a depot": outcome["duration"] > 0 and np.any(taken_out & ~after.grounded),
@@ -208,8 +222,11 @@ def events(before, after, outcome):
 
 def expected_events(shape):
     """Return what a fair sample of a shape's slots has met."""
-    yield from ("NONE", "dies")
-    yield from ("BATTERY", "DATA_AGE", "UAV") if shape.end == "first_failure" else ("HORIZON", "SHARE", "grounded", "is dead")
+    yield "dies"
+    if shape.end == "first_failure":
+        yield from ("BATTERY", "DATA_AGE", "UAV")
+    else:
+        yield from ("HORIZON", "SHARE", "grounded", "is dead")
     if shape.depots:
         yield from ("waits at a depot", "gets energy", "takes a pack")
     if shape.uavs > 1:

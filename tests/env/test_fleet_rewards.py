@@ -1,10 +1,10 @@
-"""Reward terms of fleets, worked by hand, on the layout of test_fleet_rules.py."""
+"""Reward terms of fleets, worked by hand, on the layout of small_fleets.py."""
 
 import jax.numpy as jnp
 import pytest
 from numpy.testing import assert_allclose
 
-from tests.env.test_fleet_rules import DEVICE_0, HORIZON, NORTH, ORIGIN, PARAMS, VOLUMES, fleet_layout
+from tests.env.small_fleets import DEVICE_0, HORIZON, NORTH, PARAMS, VOLUMES, fleet_layout
 from uavmec_jax.env.dynamics import initial_state, transition
 from uavmec_jax.env.fleet import make_depots
 from uavmec_jax.env.layout import Traffic
@@ -96,7 +96,9 @@ def test_a_whole_slot():
     action = jnp.array([0, 3])
     after, outcome = transition(HORIZON, TWO, before, action, VOLUMES)
     found = {term: value(term, before, action, after) for term in "AOMUS"}
-    assert {term: float(one) for term, one in found.items()} == pytest.approx({"A": 3, "O": 9, "M": 0, "U": 7, "S": 2 / 3})
+    assert {term: float(one) for term, one in found.items()} == pytest.approx(
+        {"A": 3, "O": 9, "M": 0, "U": 7, "S": 2 / 3}
+    )
     assert outcome.failed[2]
 
 
@@ -119,4 +121,3 @@ def test_the_terms_of_one_uav_are_those_of_the_paper():
     before, after = state(PARAMS, layout, age=[3, 5, 9]), state(PARAMS, layout, slot=1, battery=[3e4, 6e4, 6e4])
     found = [float(value(term, before, 1, after, layout, PARAMS)) for term in "AOMU"]
     assert found == [5, 9, 0.5, 1]
-    assert ORIGIN == tuple(before.uav_position[0])

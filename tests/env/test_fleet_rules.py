@@ -1,10 +1,4 @@
-"""Slots of fleets worked by hand, one rule of docs/model.md after the other.
-
-The layout is ``three_devices``: device 0 at (30, 40), device 1 at (30, 100), in range of device 0, and device 2 at (330, 440).
-Every task is 3 MB: 300 s of computing for each device, 3 s for the devices of QUICK; an upload takes 0.120395 s to a UAV
-above the device and 1.516768 s from device 0 to device 1 (test_dynamics.py). Depot 0, place 3, is at the origin, 50 m or 10 s
-of flight from device 0; depot 1, place 4, is 400 m or 80 s north of device 2. A UAV pays 150 W in flight and 80 W hovering.
-"""
+"""Slots of fleets worked by hand, one rule after the other; small_fleets.py has the numbers behind them."""
 
 import jax
 import jax.numpy as jnp
@@ -12,35 +6,26 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from tests.env.small_fleets import (
+    DEVICE_0,
+    DEVICE_1,
+    DEVICE_2,
+    FULL,
+    HORIZON,
+    NORTH,
+    ORIGIN,
+    PARAMS,
+    QUICK,
+    SLOW,
+    VOLUMES,
+    fleet_layout,
+    play,
+    step,
+)
 from tests.small_scenarios import three_devices
-from uavmec_jax.env.dynamics import Cause, initial_state, transition
-from uavmec_jax.env.fleet import make_depots, make_fleet
+from uavmec_jax.env.dynamics import Cause, initial_state
+from uavmec_jax.env.fleet import make_depots
 from uavmec_jax.env.params import Params
-
-PARAMS = Params(n_devices=3)
-HORIZON = Params(n_devices=3, end="horizon")
-SLOW = three_devices()
-QUICK = three_devices(processing_rate=jnp.full(3, 1e6))
-DEVICE_0, DEVICE_1, DEVICE_2 = (30.0, 40.0), (30.0, 100.0), (330.0, 440.0)
-ORIGIN, NORTH = (0.0, 0.0), (330.0, 840.0)
-FULL = 1_600_000.0
-VOLUMES = jnp.full(3, 3e6)
-
-step = jax.jit(transition)
-
-
-def fleet_layout(uavs, depots=None, base=SLOW, **values):
-    return base.replace(fleet=make_fleet(PARAMS, uavs, depots, **values), depots=depots)
-
-
-def play(layout, action, at=None, params=PARAMS, **changes):
-    """Play a slot; ``at`` are the UAVs' positions, ``changes`` are fields of the state."""
-    if at is not None:
-        changes["uav_position"] = at
-    state = initial_state(params, layout)
-    kinds = {name: getattr(state, name).dtype for name in changes}
-    state = state.replace(**{name: jnp.array(value, kinds[name]) for name, value in changes.items()})
-    return step(params, layout, state, jnp.array(action, jnp.int32), VOLUMES)
 
 
 def test_first_state_of_a_fleet():
@@ -67,7 +52,9 @@ def test_a_device_uploads_to_the_uav_with_which_it_is_through_first():
 @pytest.mark.parametrize(("action", "paid"), [([0, 1], 0.0120395), ([1, 0], 0.1516768)])
 def test_ties_go_to_the_lowest_uav(action, paid):
     # A millimetre per 1,000 s: 60 m take 6e7 s, and single precision cannot tell one upload after them from the other.
-    layout = fleet_layout(2, speed_m_s=1e-6, flying_power_w=0.0, base=three_devices(standby_power=jnp.array([0.0, 3.0, 4.0])))
+    layout = fleet_layout(
+        2, speed_m_s=1e-6, flying_power_w=0.0, base=three_devices(standby_power=jnp.array([0.0, 3.0, 4.0]))
+    )
     at = [(90.0, 40.0), (30.0, 160.0)] if action == [0, 1] else [(30.0, 160.0), (90.0, 40.0)]
     state, _ = play(layout, action, at, battery=[1.0, 6e4, 6e4])
     assert_allclose(1.0 - state.battery[0], paid, rtol=1e-4)
@@ -123,7 +110,7 @@ def test_a_hopeless_flight_does_not_stretch_the_slot():
 
 
 def test_those_that_cannot_pay_the_slot_are_taken_out_together():
-    # With 16,501 J UAV 0 can fly, but not hover for the upload's 0.12 s. Its flight counts in the round that finds UAV 1 short.
+    # With 16,501 J UAV 0 can fly, but not hover for the upload's 0.12 s; UAV 1 is found short in the same round.
     layout = fleet_layout(2, base=QUICK)
     state, outcome = play(layout, [2, 0], at=[ORIGIN, DEVICE_0], uav_energy=[16_501.0, 500.0])
     assert outcome.cause == Cause.UAV
@@ -132,7 +119,7 @@ def test_those_that_cannot_pay_the_slot_are_taken_out_together():
 
 @pytest.mark.parametrize("energy", [23_999.0, 24_000.0])
 def test_whoever_starts_pays_for_the_slot_without_the_others(energy):
-    # Served, device 2 would leave a slot of 3 s, 240 J; UAV 0 cannot pay them, device 2 computes, and the slot costs 24,000 J.
+    # With device 2 served, a slot of 3 s costs 240 J; UAV 0 cannot pay, so device 2 computes, and it costs 24,000 J.
     layout = fleet_layout(2, base=three_devices(processing_rate=jnp.array([1e6, 1e6, 1e4])))
     fleet = layout.replace(fleet=layout.fleet.replace(signal_range_m=jnp.array([65.0, 30.0])))
     state, outcome = play(fleet, [2, 0], at=[DEVICE_2, DEVICE_0], uav_energy=[100.0, energy])
@@ -236,7 +223,9 @@ def test_the_uav_of_the_parameters_is_a_fleet_of_one():
 def test_places_out_of_range_are_the_nearest():
     layout = fleet_layout(2, make_depots([NORTH]))
     at, full = [DEVICE_1, DEVICE_2], jnp.full(2, FULL)
-    jax.tree.map(assert_array_equal, play(layout, [-1, 99], at, uav_energy=full), play(layout, [0, 3], at, uav_energy=full))
+    jax.tree.map(
+        assert_array_equal, play(layout, [-1, 99], at, uav_energy=full), play(layout, [0, 3], at, uav_energy=full)
+    )
     jax.tree.map(assert_array_equal, play(SLOW, -1), play(SLOW, 0))
     jax.tree.map(assert_array_equal, play(SLOW, 99), play(SLOW, 2))
 
