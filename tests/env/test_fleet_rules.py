@@ -25,12 +25,13 @@ from tests.env.small_fleets import (
 from tests.small_scenarios import three_devices
 from uavmec_jax.env.dynamics import Cause, initial_state
 from uavmec_jax.env.fleet import make_depots
+from uavmec_jax.env.layout import mask_absent
 from uavmec_jax.env.params import Params
 
 
 def test_first_state_of_a_fleet():
-    depots = make_depots([ORIGIN, NORTH], packs=[2, 5])
-    state = initial_state(PARAMS, fleet_layout(3, depots, battery_j=[1e5, 2e5, 3e5]))
+    depots = make_depots([ORIGIN, NORTH], packs=np.array([2, 5]))
+    state = initial_state(PARAMS, fleet_layout(3, depots, battery_j=np.array([1e5, 2e5, 3e5])))
     assert_array_equal(state.uav_position, [ORIGIN, NORTH, ORIGIN])
     assert_array_equal(state.uav_energy, [1e5, 2e5, 3e5])
     assert_array_equal(state.grounded, [False] * 3)
@@ -130,8 +131,13 @@ def test_whoever_starts_pays_for_the_slot_without_the_others(energy):
 
 def test_each_uav_has_its_own_range_speed_and_powers():
     # UAV 0 reaches device 1 from device 0, 60.83 m away, UAV 1 would not. Flights: 50 m at 10 m/s = 5 s, 110 m at 2 m/s.
-    values = {"signal_range_m": [61.0, 60.5], "speed_m_s": [10.0, 2.0], "flying_power_w": [100.0, 200.0]}
-    layout = fleet_layout(2, hovering_power_w=[50.0, 70.0], **values)
+    layout = fleet_layout(
+        2,
+        speed_m_s=np.array([10.0, 2.0]),
+        flying_power_w=np.array([100.0, 200.0]),
+        hovering_power_w=np.array([50.0, 70.0]),
+        signal_range_m=np.array([61.0, 60.5]),
+    )
     state, outcome = play(layout, [0, 2], at=[ORIGIN, (330.0, 330.0)])
     assert_array_equal(outcome.served, [True, True, True])
     assert_allclose(outcome.duration, 55.120395, rtol=1e-6)
@@ -161,12 +167,12 @@ def test_pads_of_a_charging_depot():
 
 def test_charging_ends_at_the_capacity():
     depots = make_depots([ORIGIN], kind="charge")
-    state, _ = play(fleet_layout(2, depots, battery_j=[1e5, 2e5]), [3, 3], uav_energy=[99_000.0, 1000.0])
+    state, _ = play(fleet_layout(2, depots, battery_j=np.array([1e5, 2e5])), [3, 3], uav_energy=[99_000.0, 1000.0])
     assert_array_equal(state.uav_energy, [1e5, 2e5])
 
 
 def test_depots_in_one_place_are_the_first_of_them():
-    depots = make_depots([NORTH, ORIGIN, ORIGIN], packs=[1, 3, 9])
+    depots = make_depots([NORTH, ORIGIN, ORIGIN], packs=np.array([1, 3, 9]))
     state, _ = play(fleet_layout(2, depots), [5, 4], at=[ORIGIN, ORIGIN], uav_energy=[1.0, 1.0])
     assert_array_equal(state.uav_energy, [FULL, FULL])
     assert_array_equal(state.packs, [1, 1, 9])
@@ -175,18 +181,19 @@ def test_depots_in_one_place_are_the_first_of_them():
 HELP = {
     "swap": ({}, Cause.NONE, FULL),
     "swap without packs": ({"packs": 0}, Cause.UAV, 9.0),
-    "swap without pads": ({"pads": 0}, Cause.UAV, 9.0),
+    "swap in padding": ({"pads": 0.0}, Cause.UAV, 9.0),
     "charge": ({"kind": "charge", "power_w": 10.0}, Cause.NONE, 3009.0),
     "charge without packs": ({"kind": "charge", "power_w": 10.0, "packs": 0}, Cause.NONE, 3009.0),
     "charge without power": ({"kind": "charge", "power_w": 0.0}, Cause.UAV, 9.0),
-    "charge without pads": ({"kind": "charge", "pads": 0}, Cause.UAV, 9.0),
+    "charge in padding": ({"kind": "charge", "pads": 0.0}, Cause.UAV, 9.0),
 }
 
 
 @pytest.mark.parametrize(("depot", "cause", "energy"), HELP.values(), ids=HELP)
 def test_the_uavs_end_the_episode_only_where_no_depot_helps(depot, cause, energy):
     # UAV 0 is out at depot 0 and UAV 1 in the field; without them the slot lasts 300 s.
-    layout = fleet_layout(2, make_depots([ORIGIN], **depot))
+    made = make_depots([ORIGIN], **{name: value for name, value in depot.items() if name != "pads"})
+    layout = fleet_layout(2, made.replace(pads=jnp.array([depot.get("pads", 1.0)])))
     state, outcome = play(layout, [2, 2], at=[ORIGIN, DEVICE_0], uav_energy=[9.0, 9.0])
     assert outcome.cause == cause
     assert_array_equal(outcome.started, [False, False])
@@ -233,8 +240,7 @@ def test_places_out_of_range_are_the_nearest():
 def test_padded_uavs_are_grounded_from_the_start():
     # The padding would be at device 2, and at a depot that could help it.
     depots = make_depots([ORIGIN])
-    layout = fleet_layout(2, depots, start_m=[DEVICE_0, ORIGIN])
-    layout = layout.replace(fleet=layout.fleet.replace(present=jnp.array([True, False])))
+    layout = fleet_layout(2, depots, start_m=np.array([DEVICE_0, ORIGIN]), present=np.array([True, False]))
     assert_array_equal(initial_state(PARAMS, layout).grounded, [False, True])
     state, outcome = play(layout, [0, 2])
     assert_array_equal(outcome.served, [True, True, False])
@@ -250,7 +256,15 @@ def test_what_a_state_leaves_out_has_not_happened():
     jax.tree.map(assert_array_equal, outcome, expected)
 
 
+@pytest.mark.parametrize("params", [PARAMS, HORIZON], ids=["first_failure", "horizon"])
+def test_absent_devices_do_not_stretch_the_slot(params):
+    # Devices 0 and 1 are served within 1.516768 s. A connected device would send its results for 8 s; this one is padding.
+    layout = mask_absent(fleet_layout(2), jnp.array([True, True, False]))
+    _, outcome = play(layout, [0, 0], at=[DEVICE_0, DEVICE_0], params=params.replace(uplink_rate_bit_s=1000.0))
+    assert_allclose(outcome.duration, 1.516768, rtol=1e-6)
+
+
 def test_a_padded_depot_has_no_pads():
-    depots = make_depots([ORIGIN], pads=0)
+    depots = make_depots([ORIGIN]).replace(pads=jnp.zeros(1))
     state, _ = play(fleet_layout(1, depots), 3, uav_energy=[100.0])
     assert_array_equal(state.uav_energy, np.float32([100]))
