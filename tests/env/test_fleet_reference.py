@@ -49,7 +49,9 @@ SHAPES = [
     Shape(4, 3, 7, "horizon"),
     Shape(6, 2, 8, "first_failure"),
 ]
-ALL_SHAPES = [Shape(k, d, 4 + k, end) for k in (1, 2, 3, 4, 6) for d in range(4) for end in ("first_failure", "horizon")]
+ALL_SHAPES = [
+    Shape(k, d, 4 + k, end) for k in (1, 2, 3, 4, 6) for d in range(4) for end in ("first_failure", "horizon")
+]
 
 
 def name(shape):
@@ -210,10 +212,10 @@ def play_episodes(shape, episodes, seed=0):
 
 def events(before, after, outcome, left_out):
     taken_out = ~before.grounded & ~outcome["started"]
-    return {
-        "slots": 1,
+    happened = {
+        "slots": True,
         "left out": left_out,
-        Cause(outcome["cause"]).name: 1,
+        Cause(outcome["cause"]).name: True,
         "grounded": np.any(after.grounded & ~before.grounded),
         "starts without a neighbour": np.any(taken_out) and np.any(outcome["started"]),
         "waits at a depot": outcome["duration"] > 0 and np.any(taken_out & ~after.grounded),
@@ -222,6 +224,7 @@ def events(before, after, outcome, left_out):
         "dies": np.any((before.failed_at < 0) & (after.failed_at >= 0)),
         "is dead": np.any(before.failed_at >= 0),
     }
+    return {event: int(whether) for event, whether in happened.items()}
 
 
 def expected_events(shape):
