@@ -32,8 +32,8 @@ def mid_life(seed, n, **overrides):
     state = State(
         battery=layout.capacity * jax.random.uniform(k_battery, (n,), minval=0.2),
         age=jnp.where(layout.has_comms, 0, jax.random.randint(k_age, (n,), 0, 9)),
-        uav_position=layout.position[jax.random.randint(k_position, (), 0, n)],
-        uav_energy=jnp.float32(900_000.0),
+        uav_position=layout.position[jax.random.randint(k_position, (1,), 0, n)],
+        uav_energy=jnp.array([900_000.0]),
         slot=jnp.int32(8),
         elapsed=jnp.float32(4_000.0),
     )

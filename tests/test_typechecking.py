@@ -23,7 +23,7 @@ WRONG_FIELDS = {
     "dtype": ({"age": jnp.zeros(3)}, r"State\.age is float32\[3\]; it should be .*Int"),
     "dtype of a NumPy array": ({"age": np.zeros(3)}, r"State\.age is float64\[3\]; it should be .*Int"),
     "Python number": ({"slot": 0.5}, r"State\.slot is 0\.5; it should be .*Int"),
-    "shape": ({"uav_position": jnp.zeros(3)}, r"State\.uav_position is float32\[3\]; it should be .*batch 2"),
+    "shape": ({"uav_position": jnp.zeros(3)}, r"State\.uav_position is float32\[3\]; it should be .*batch K 2"),
     "rank": ({"battery": jnp.zeros(())}, r"State\.battery is float32\[\]; it should be .*batch n"),
     "another n": ({"age": jnp.zeros(4, jnp.int32)}, r"State\.age is int32\[4\]; it should be .*batch n"),
     "another batch": ({"slot": jnp.zeros(4, jnp.int32)}, r"State\.slot is int32\[4\]; it should be .*batch"),

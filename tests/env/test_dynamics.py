@@ -24,8 +24,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from tests.small_scenarios import three_devices
-from uavmec_jax.env import dynamics
-from uavmec_jax.env.dynamics import Cause, State, initial_state, transition, upload_rate
+from uavmec_jax.env import channel
+from uavmec_jax.env.channel import upload_rate
+from uavmec_jax.env.dynamics import Cause, State, initial_state, transition
 from uavmec_jax.env.params import Params
 
 pytestmark = pytest.mark.usefixtures("with_and_without_jit")
@@ -44,7 +45,7 @@ def test_first_state():
     state = initial_state(Params(n_devices=3), NO_POWER_NO_COMMS)
     assert_array_equal(state.battery, [60_000, 60_000, 60_000])
     assert_array_equal(state.age, [0, 0, 0])
-    assert_array_equal(state.uav_position, [0, 0])
+    assert_array_equal(state.uav_position, [[0, 0]])
     assert (state.uav_energy, state.slot) == (1_600_000, 0)
 
 
@@ -52,7 +53,7 @@ def test_whole_slot():
     state, outcome = play()
     assert_allclose(state.battery, [59_399.98796, 59_099.84832, 58_050.0], rtol=1e-7)
     assert_array_equal(state.age, [0, 0, 1])
-    assert_array_equal(state.uav_position, [30, 40])
+    assert_array_equal(state.uav_position, [[30, 40]])
     assert_allclose(state.uav_energy, 1_600_000 - 24_700, rtol=1e-7)
     assert state.slot == 1
     assert outcome.cause == Cause.NONE
@@ -74,12 +75,12 @@ def test_shannon_rate_of_a_weak_signal():
 
 def test_log1p_is_accurate_over_the_whole_range():
     x = np.float32(10 ** np.linspace(-12, 6, 2000))
-    assert_allclose(jax.jit(dynamics._log1p)(jnp.asarray(x)), np.log1p(x.astype(float)), rtol=4e-7)
+    assert_allclose(jax.jit(channel._log1p)(jnp.asarray(x)), np.log1p(x.astype(float)), rtol=4e-7)
 
 
 def test_staying_flies_nowhere():
     # From device 0 to device 0: no flight, the slot is still the 300 s of device 2, the UAV hovers: 80 * 300 = 24,000 J.
-    state, outcome = play(uav_position=jnp.array([30.0, 40.0]))
+    state, outcome = play(uav_position=jnp.array([[30.0, 40.0]]))
     assert_allclose(outcome.duration, 300.0)
     assert_allclose(state.uav_energy, 1_600_000 - 24_000, rtol=1e-7)
 
@@ -169,8 +170,8 @@ def test_first_battery_inside_the_slot():
 
 
 def test_slot_beyond_the_uav_battery_never_starts():
-    before = initial_state(Params(n_devices=3), NO_POWER_NO_COMMS).replace(uav_energy=jnp.float32(24_699.0))
-    state, outcome = play(uav_energy=jnp.float32(24_699.0), age=jnp.array([0, 0, 10]))
+    before = initial_state(Params(n_devices=3), NO_POWER_NO_COMMS).replace(uav_energy=jnp.array([24_699.0]))
+    state, outcome = play(uav_energy=jnp.array([24_699.0]), age=jnp.array([0, 0, 10]))
     assert outcome.cause == Cause.UAV
     assert_array_equal(state.battery, before.battery)
     assert_array_equal(state.age, [0, 0, 10])
@@ -184,14 +185,14 @@ def test_slot_beyond_the_uav_battery_never_starts():
 
 def test_slot_that_empties_the_uav_battery_is_played():
     # Staying put costs exactly 24,000 J.
-    state, outcome = play(uav_energy=jnp.float32(24_000.0), uav_position=jnp.array([30.0, 40.0]))
+    state, outcome = play(uav_energy=jnp.array([24_000.0]), uav_position=jnp.array([[30.0, 40.0]]))
     assert outcome.cause == Cause.NONE
     assert (state.uav_energy, state.slot) == (0, 1)
 
 
 def test_count_unfinished_slot():
     params = Params(n_devices=3, count_unfinished_slot=True)
-    state, outcome = play(uav_energy=jnp.float32(1.0), params=params)
+    state, outcome = play(uav_energy=jnp.array([1.0]), params=params)
     assert outcome.cause == Cause.UAV
     assert state.slot == 1
 
@@ -219,7 +220,7 @@ def test_channel_constants_are_parameters(name, value):
 
 
 def test_state_is_not_changed_in_place():
-    state = State(jnp.full(3, 6e4), jnp.zeros(3, jnp.int32), jnp.zeros(2), jnp.float32(1e6), jnp.int32(0))
+    state = State(jnp.full(3, 6e4), jnp.zeros(3, jnp.int32), jnp.zeros((1, 2)), jnp.array([1e6]), jnp.int32(0))
     transition(Params(n_devices=3), NO_POWER_NO_COMMS, state, jnp.int32(0), VOLUMES)
     assert_array_equal(state.battery, [6e4] * 3)
 

@@ -13,7 +13,7 @@ LAYOUT = three_devices()
 
 
 def state(age, battery=(6e4, 6e4, 6e4), slot=0):
-    return State(jnp.array(battery), jnp.array(age, jnp.int32), jnp.zeros(2), jnp.float32(1e6), jnp.int32(slot))
+    return State(jnp.array(battery), jnp.array(age, jnp.int32), jnp.zeros((1, 2)), jnp.array([1e6]), jnp.int32(slot))
 
 
 # Visit device 1, aged 3, while the oldest data are 7 slots old; afterwards 5 slots are done and the lowest battery is at

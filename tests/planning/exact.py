@@ -70,7 +70,7 @@ def _non_dominated(layout: Layout, states: State, hover_point: Int[np.ndarray, "
     """Return the indices of the states that no other dominates; of equal states the first."""
     age = np.where(layout.has_comms, 0, -states.age)
     battery = np.where(layout.has_power, 0.0, states.battery)
-    criteria = np.concatenate([age, battery, states.uav_energy[:, None]], axis=1)
+    criteria = np.concatenate([age, battery, states.uav_energy], axis=1)
     kept: list[int] = []
     for hover in np.unique(hover_point):
         members = np.flatnonzero(hover_point == hover)

@@ -63,7 +63,7 @@ def test_dominance():
     states = states.replace(
         age=states.age.at[1, 0].set(1),  # older data than 0
         battery=states.battery.at[2, 3].add(-1.0),  # less battery than 0
-        uav_energy=states.uav_energy.at[3].add(1.0),  # more energy than 0, but at another hover point
+        uav_energy=states.uav_energy.at[3, 0].add(1.0),  # more energy than 0, but at another hover point
     )
     hover_point, alive = jnp.array([5, 5, 5, 6, 5]), jnp.ones(5, bool)
     assert _dominated(layout, states, hover_point, alive).tolist() == [False, True, True, False, True]  # 4 is 0 again

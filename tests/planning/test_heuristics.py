@@ -93,7 +93,7 @@ def test_earliest_deadline_collects_data_just_in_time_and_serves_batteries_in_be
 
 def test_earliest_deadline_stays_where_no_visit_is_needed():
     layout = layout_for_seed(0, Params(), 12, 12)
-    state = initial_state(Params(), layout).replace(uav_position=layout.position[7])
+    state = initial_state(Params(), layout).replace(uav_position=layout.position[7:8])
     assert jax.jit(earliest_deadline)(Params(), layout, state) == 7
 
 

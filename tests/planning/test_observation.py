@@ -101,8 +101,9 @@ def test_features_of_padding_are_zero():
 
 def test_a_state_of_another_number_of_devices_is_refused(small):
     params, layout, state = small
+    of_four = {"battery": jnp.ones(4), "age": jnp.zeros(4, jnp.int32), "failed_at": jnp.full(4, -1)}
     with pytest.raises(AssertionError, match="shape"):
-        observe_devices(params, layout, state.replace(battery=jnp.ones(4), age=jnp.zeros(4, jnp.int32)))
+        observe_devices(params, layout, state.replace(**of_four))
 
 
 @pytest.mark.slow

@@ -83,7 +83,7 @@ def test_degrees_need_an_origin():
 
 
 BAD = {
-    "no device": ('name = "x"', "holds 0 devices; give 1 to 64"),
+    "no device": ('name = "x"', "holds 0 devices; give 1 to 1000"),
     "outside": (
         DEVICE.replace("x_m = 1.0", "x_m = 900.0"),
         "device 1 (a): lies at 900, 1 m, outside the region of 800 x",

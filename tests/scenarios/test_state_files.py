@@ -34,10 +34,10 @@ def test_values_by_position_and_by_name():
     assert_array_equal(
         listed.age, np.where(HARBOUR.layout.has_comms, 0, ages)
     )  # connected devices deliver by themselves
-    assert (float(listed.uav_energy), int(listed.slot)) == (900_000, 7)
+    assert (float(listed.uav_energy[0]), int(listed.slot)) == (900_000, 7)
     named = state_of({"battery_j": {NAMES[2]: 1234.0}, "uav_at": NAMES[1]})
     assert_allclose(named.battery, [*CAPACITY[:2], 1234.0, *CAPACITY[3:]], rtol=1e-6)
-    assert_array_equal(named.uav_position, HARBOUR.layout.position[1])
+    assert_array_equal(named.uav_position[0], HARBOUR.layout.position[1])
 
 
 def test_round_trip(tmp_path):

@@ -1,8 +1,8 @@
 """The dynamics of one time slot, a pure function of explicit task volumes (paper, sections 3.1 and 4)."""
 
 import enum
-import math
 from dataclasses import replace
+from functools import partial
 
 import chex
 import jax
@@ -10,8 +10,11 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
-from uavmec_jax.env.layout import Layout
+from uavmec_jax.env.depots import can_help, serve_landed, stands_at
+from uavmec_jax.env.fleet import Fleet
+from uavmec_jax.env.layout import Layout, fleet_of
 from uavmec_jax.env.params import Params
+from uavmec_jax.env.slot import Flights, Services, plan_flights, services_of, who_starts
 from uavmec_jax.env.types import Scalar
 
 
@@ -25,7 +28,11 @@ class Cause(enum.IntEnum):
     DATA_AGE = 2
     """A device's data are too old (constraint 1g)."""
     UAV = 3
-    """The UAV's battery does not cover the next slot."""
+    """No UAV's battery covers the next slot, and none stands at a depot that can still help."""
+    HORIZON = 4
+    """The time of an episode with ``end = "horizon"`` is over."""
+    SHARE = 5
+    """So many batteries are empty that an episode with ``end = "horizon"`` is over."""
 
 
 @struct.dataclass
@@ -35,18 +42,26 @@ class State:
     Attributes:
         battery: energy left in each device, J.
         age: slots since each device's data were last delivered, int32.
-        uav_position: position of the UAV, m.
-        uav_energy: energy left in the UAV, J.
+        uav_position: position of each UAV, m.
+        uav_energy: energy left in each UAV, J.
         slot: slots completed, int32.
         elapsed: total length of the slots completed, s.
+        grounded: UAVs that could not pay for a slot and are out for the rest of the episode; ``None``: none.
+        failed_at: value of ``slot`` after the slot in which each battery ran out, -1 for devices that are alive;
+            ``None``: all are.
+        packs: full batteries in stock at each depot; ``None``: those of the start.
     """
 
     battery: Float[Array, "*batch n"]
     age: Int[Array, "*batch n"]
-    uav_position: Float[Array, "*batch 2"]
-    uav_energy: Float[Array, "*batch"]
+    uav_position: Float[Array, "*batch K 2"]
+    uav_energy: Float[Array, "*batch K"]
     slot: Int[Array, "*batch"]
     elapsed: Scalar = 0.0
+    # The last three may be left out; complete_state puts them in.
+    grounded: Bool[Array, "*batch K"] = None  # type: ignore[assignment]
+    failed_at: Int[Array, "*batch n"] = None  # type: ignore[assignment]
+    packs: Float[Array, "*batch D"] = None  # type: ignore[assignment]
 
 
 @struct.dataclass
@@ -55,8 +70,8 @@ class Outcome:
 
     Attributes:
         cause: why the episode ended with this slot, a :class:`Cause` as int32.
-        failed: devices that failed in this slot.
-        served: devices within range of the hover point.
+        failed: devices that failed in this slot: their battery ran out or their data expired.
+        served: devices within range of a UAV that hovers.
         duration: length of the slot, s; 0 if it never started.
         first_failure: each device's share in the first failure. Shares sum to 1 if a device failed: the battery that
             runs out earliest inside the slot has all of it; devices whose data expired share it equally.
@@ -70,15 +85,29 @@ class Outcome:
 
 
 def initial_state(params: Params, layout: Layout) -> State:
-    """Return the state before the first slot: full batteries, fresh data, the UAV in the origin corner."""
-    return State(
+    """Return the state before the first slot: full batteries, fresh data, every UAV where it starts."""
+    fleet = fleet_of(params, layout)
+    state = State(
         battery=jnp.asarray(layout.capacity, jnp.float32),
         age=jnp.zeros(layout.capacity.shape, jnp.int32),
-        uav_position=jnp.zeros((2,), jnp.float32),
-        uav_energy=jnp.asarray(params.uav_battery_j, jnp.float32),
+        uav_position=jnp.asarray(fleet.start_m, jnp.float32),
+        uav_energy=jnp.asarray(fleet.battery_j, jnp.float32),
         slot=jnp.zeros((), jnp.int32),
         elapsed=jnp.zeros((), jnp.float32),
     )
+    state = complete_state(layout, state)
+    return state if fleet.present is None else replace(state, grounded=~fleet.present)
+
+
+def complete_state(layout: Layout, state: State) -> State:
+    """Return a state with the fields that were left out: no UAV grounded, all devices alive, all packs in stock."""
+    packs = jnp.zeros(0, jnp.float32) if layout.depots is None else jnp.asarray(layout.depots.packs, jnp.float32)
+    defaults = {
+        "grounded": jnp.zeros(layout.n_uavs, bool),
+        "failed_at": jnp.full(layout.n_devices, -1, jnp.int32),
+        "packs": packs,
+    }
+    return replace(state, **{name: value for name, value in defaults.items() if getattr(state, name) is None})
 
 
 def slots_to_expiry(params: Params) -> Int[Array, "*batch"]:
@@ -86,102 +115,162 @@ def slots_to_expiry(params: Params) -> Int[Array, "*batch"]:
     return jnp.where(params.age_at_limit_fails, params.data_age_limit_slots, params.data_age_limit_slots + 1)
 
 
-def upload_rate(params: Params, slant_distance_m: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Return the Shannon rate of an upload to the UAV, bit/s (paper, equation 4); each served device has the full band."""
-    gain = params.reference_gain * jnp.exp(-params.path_loss_exponent * jnp.log(slant_distance_m))
-    snr = params.transmit_power_w * gain / params.noise_power_w
-    return params.bandwidth_hz * _log1p(snr) / math.log(2.0)
+def in_service(params: Params, layout: Layout, state: State) -> Bool[Array, " n"]:
+    """Return the devices that work and whose data have not expired."""
+    return _living(layout, state) & (state.age < slots_to_expiry(params))
 
 
-def _log1p(x: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Return ``log(1 + x)`` for ``x >= 0`` with a relative error below 3e-7.
+def service(params: Params, layout: Layout, state: State) -> Float[Array, ""]:
+    """Return the share of the devices that are :func:`in_service`, weighted by their priorities."""
+    weight = jnp.ones(layout.n_devices) if layout.priority is None else layout.priority
+    weight = weight if layout.present is None else jnp.where(layout.present, weight, 0.0)
+    return jnp.sum(jnp.where(in_service(params, layout, state), weight, 0.0)) / jnp.sum(weight)
 
-    XLA's ``log1p`` costs as much as the rest of the slot. Small arguments use the series of ``2 artanh(x / (2 + x))``.
-    """
-    z = x / (2.0 + x)
-    square = z * z
-    series = 2.0 * z * (1.0 + square * (1 / 3 + square * (1 / 5 + square * (1 / 7))))
-    return jnp.where(x < 0.25, series, jnp.log(1.0 + x))
+
+def living_devices(params: Params, layout: Layout, state: State) -> Bool[Array, " n"] | None:
+    """Return the devices that work in the next slot; ``None`` if all do, because the first failure ends the episode."""
+    return None if params.end == "first_failure" else _living(layout, state)
+
+
+def _living(layout: Layout, state: State) -> Bool[Array, " n"]:
+    alive = complete_state(layout, state).failed_at < 0
+    return alive if layout.present is None else alive & layout.present
 
 
 def transition(
-    params: Params, layout: Layout, state: State, action: Int[ArrayLike, ""], volumes: Num[Array, " n"]
+    params: Params,
+    layout: Layout,
+    state: State,
+    action: Int[ArrayLike, ""] | Int[Array, " K"],
+    volumes: Num[Array, " n"],
 ) -> tuple[State, Outcome]:
-    """Fly to a device, serve all devices in range, let the others compute, and check for failures.
+    """Let every UAV fly to a place, serve all devices in range, let the others compute, and check for failures.
 
     Args:
         params: scenario parameters.
-        layout: the devices, without batch axes (use ``vmap``).
+        layout: the devices, the UAVs and the depots, without batch axes (use ``vmap``).
         state: the state before the slot.
-        action: int in ``[0, n)``, the device to visit; staying is allowed. (Out of range is clamped, as JAX indexes.)
+        action: the place that each UAV flies to: a device in ``[0, n)`` or a depot in ``[n, n + D)``; staying is allowed.
+            A scalar if there is one UAV. (Out of range is clamped.)
         volumes: ``[n]`` bytes, each device's task in this slot.
 
     Returns:
-        The state after the slot and its :class:`Outcome`. If the UAV's battery does not cover the slot, nothing
-        happens in it.
+        The state after the slot and its :class:`Outcome`. If no UAV's battery covers the slot and no depot helps, nothing
+        happens in it, and the cause is :attr:`Cause.UAV`; under ``end = "horizon"`` it goes on without UAVs.
     """
-    n = layout.capacity.shape[-1]
+    n = layout.n_devices
     chex.assert_shape([layout.capacity, state.battery, state.age, volumes], (n,))
-    chex.assert_rank(action, 0)
-    hover_point = layout.position[action]
-    t_fly = jnp.linalg.norm(hover_point - state.uav_position) / params.uav_speed_m_s
-    ground = layout.position - hover_point
-    slant = jnp.sqrt(jnp.sum(ground**2, axis=-1) + params.uav_altitude_m**2)
-    served = (slant <= params.uav_signal_range_m) | (jnp.arange(n) == action)
+    state, fleet = complete_state(layout, state), fleet_of(params, layout)
+    living = living_devices(params, layout, state)
+    target = jnp.atleast_1d(action)
+    chex.assert_shape(target, (layout.n_uavs,))
+    target = jnp.clip(target, 0, layout.n_places - 1)
+    flights = plan_flights(params, layout, fleet, state.uav_position, target, volumes)
+    services = partial(services_of, params, fleet, flights, living)
 
-    t_upload = 8.0 * volumes / upload_rate(params, slant)
-    t_compute = jnp.minimum(volumes / layout.processing_rate, params.slot_cap_s)
-    t_results = jnp.where(layout.has_comms, 8.0 * params.result_message_bytes / params.uplink_rate_bit_s, 0.0)
-    duration = jnp.max(jnp.where(served, t_fly + t_upload, t_compute + t_results))
+    if (
+        layout.n_uavs == 1 and not layout.n_depots and living is None
+    ):  # the paper's model: the UAV starts or nothing does
+        slot = services(None)
+        happens = (~state.grounded & (state.uav_energy >= slot.cost))[0]
+        started = jnp.ones(1, bool)
+    else:
+        started = who_starts(fleet, flights, state.uav_energy, ~state.grounded, services)
+        slot = services(started)
+        happens = jnp.any(started) | _helped(layout, state) if living is None else jnp.asarray(True)
 
-    t_hover = duration - jnp.where(params.flight_power_adds_to_hover, 0.0, t_fly)
-    uav_cost = params.uav_flying_power_w * t_fly + params.uav_hovering_power_w * t_hover
-    starts = state.uav_energy >= uav_cost
-
-    work = jnp.where(
-        served,
-        params.transmit_power_w * t_upload,
-        layout.active_power * t_compute + params.transmit_power_w * t_results,
-    )
-    drain = jnp.where(layout.has_power, 0.0, layout.standby_power * duration + work)
-    after = State(
-        battery=jnp.maximum(state.battery - drain, 0.0),
-        age=jnp.where(served, 0, state.age + jnp.where(layout.has_comms, 0, 1)),
-        uav_position=hover_point,
-        uav_energy=state.uav_energy - uav_cost,
-        slot=state.slot + 1,
-        elapsed=state.elapsed + duration,
-    )
+    after, drain = _play(params, layout, fleet, state, flights, slot, started, living)
     unstarted = replace(state, slot=state.slot + jnp.where(params.count_unfinished_slot, 1, 0))
-    after = jax.tree.map(lambda played, kept: jnp.where(starts, played, kept), after, unstarted)
-    empty = starts & (after.battery <= 0.0)
-    return after, _outcome(params, state, after, starts, served, duration, drain, empty)
+    after = jax.tree.map(lambda played, kept: jnp.where(happens, played, kept), after, unstarted)
+    return after, _outcome(params, layout, state, after, happens, slot, drain, living)
+
+
+def _helped(layout: Layout, state: State) -> Bool[Array, ""]:
+    """Return whether a UAV stands at a depot that can still swap or charge its battery."""
+    if layout.depots is None:
+        return jnp.asarray(False)
+    stands = stands_at(layout.depots, state.uav_position) & ~state.grounded[:, None]
+    return jnp.any(stands & can_help(layout.depots, state.packs))
+
+
+def _play(
+    params: Params,
+    layout: Layout,
+    fleet: Fleet,
+    state: State,
+    flights: Flights,
+    slot: Services,
+    started: Bool[Array, " K"],
+    living: Bool[Array, " n"] | None,
+) -> tuple[State, Float[Array, " n"]]:
+    """Return the state after a slot, and the energy in J that each device used in it."""
+    work = jnp.where(
+        slot.served,
+        params.transmit_power_w * slot.t_upload,
+        layout.active_power * flights.t_compute + params.transmit_power_w * flights.t_results,
+    )
+    idle = layout.has_power if living is None else layout.has_power | ~living
+    drain = jnp.where(idle, 0.0, layout.standby_power * slot.duration + work)
+    battery = jnp.maximum(state.battery - drain, 0.0)
+    age = jnp.where(slot.served, 0, state.age + jnp.where(layout.has_comms, 0, 1))
+    empty = battery <= 0.0 if living is None else living & (battery <= 0.0)
+    position = jnp.where(started[:, None], flights.place, state.uav_position)
+    energy = state.uav_energy - jnp.where(started, slot.cost, 0.0)
+    grounded, packs = state.grounded | ~started, state.packs
+    if layout.depots is not None:
+        stood = stands_at(layout.depots, state.uav_position) & ~state.grounded[:, None]
+        grounded = state.grounded | ~(started | jnp.any(stood, axis=1))
+        lands = stands_at(layout.depots, position) & jnp.where(started, ~flights.hovers, ~grounded)[:, None]
+        seconds = slot.duration - jnp.where(started, flights.t_fly, 0.0)
+        energy, packs = serve_landed(layout.depots, packs, lands, energy, fleet.battery_j, seconds)
+    after = State(
+        battery=battery,
+        age=age if living is None else jnp.where(living, age, state.age),
+        uav_position=position,
+        uav_energy=energy,
+        slot=state.slot + 1,
+        elapsed=state.elapsed + slot.duration,
+        grounded=grounded,
+        failed_at=jnp.where(empty & (state.failed_at < 0), state.slot + 1, state.failed_at),
+        packs=packs,
+    )
+    return after, drain
 
 
 def _outcome(
     params: Params,
+    layout: Layout,
     before: State,
     after: State,
-    starts: Bool[Array, ""],
-    served: Bool[Array, " n"],
-    duration: Float[Array, ""],
+    happens: Bool[Array, ""],
+    slot: Services,
     drain: Float[Array, " n"],
-    empty: Bool[Array, " n"],
+    living: Bool[Array, " n"] | None,
 ) -> Outcome:
     """Check for failures after the slot; an empty battery takes precedence over expired data."""
-    expired = starts & (after.age >= slots_to_expiry(params))
-    cause = jnp.where(
-        starts,
-        jnp.where(jnp.any(empty), Cause.BATTERY, jnp.where(jnp.any(expired), Cause.DATA_AGE, Cause.NONE)),
-        Cause.UAV,
-    )
+    empty = happens & (after.battery <= 0.0)
+    expired = happens & (after.age >= slots_to_expiry(params))
+    if living is not None:
+        empty, expired = empty & living, expired & living & (before.age < slots_to_expiry(params))
+        cause = _cause_at_horizon(params, layout, after)
+    else:
+        failure = jnp.where(jnp.any(empty), Cause.BATTERY, jnp.where(jnp.any(expired), Cause.DATA_AGE, Cause.NONE))
+        cause = jnp.where(happens, failure, Cause.UAV)
     # Mean power over the slot is drain / duration, so a battery lasts battery / drain of the slot.
     lasts = jnp.where(empty, before.battery / jnp.where(empty, drain, 1.0), jnp.inf)
     first = jnp.where(jnp.any(empty), empty & (lasts <= jnp.min(lasts)), expired)
     return Outcome(
         cause=cause.astype(jnp.int32),
         failed=empty | expired,
-        served=served & starts,
-        duration=jnp.where(starts, duration, 0.0),
+        served=slot.served & happens,
+        duration=jnp.where(happens, slot.duration, 0.0),
         first_failure=first / jnp.maximum(jnp.sum(first), 1),
     )
+
+
+def _cause_at_horizon(params: Params, layout: Layout, after: State) -> Int[Array, ""]:
+    """Return why an episode ends that no failure ends: enough devices have an empty battery, or its time is over."""
+    present = jnp.ones(layout.n_devices, bool) if layout.present is None else layout.present
+    dead = jnp.sum(present & (after.failed_at >= 0))
+    enough = dead >= jnp.ceil(params.end_share * jnp.sum(present) - 1e-6)
+    return jnp.where(enough, Cause.SHARE, jnp.where(after.elapsed >= params.horizon_s, Cause.HORIZON, Cause.NONE))

@@ -10,6 +10,7 @@ from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num, PRNGKeyArray
 
 from uavmec_jax.env import hardware
+from uavmec_jax.env.fleet import UAV_FIELDS, Depots, Fleet, default_start
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.types import Scalar
 
@@ -39,7 +40,7 @@ class Traffic:
 
 @struct.dataclass
 class Layout:
-    """The devices of one scenario; every field has one entry per device.
+    """The devices of one scenario, and what serves them; every array has one entry per device.
 
     Attributes:
         position: coordinates in the region, m.
@@ -53,6 +54,9 @@ class Layout:
         processing_rate: given by type and task, bytes/s.
         traffic: the traffic around the devices, ``None`` if it is unknown.
         present: which entries are devices and not padding (:func:`pad_layout`); ``None`` if all are.
+        priority: weight of each device in measures of service, e.g. of a hospital's; ``None``: all weigh 1.
+        fleet: the UAVs, ``None`` for the one of the parameters.
+        depots: where UAVs swap or charge their batteries, ``None`` for none.
     """
 
     position: Float[Array, "*batch n 2"]
@@ -66,12 +70,52 @@ class Layout:
     processing_rate: Float[Array, "*batch n"]
     traffic: Traffic | None = None
     present: Bool[Array, "*batch n"] | None = None
+    priority: Float[Array, "*batch n"] | None = None
+    fleet: Fleet | None = None
+    depots: Depots | None = None
+
+    @property
+    def n_devices(self) -> int:
+        """Number of devices ``n``, padding included."""
+        return self.capacity.shape[-1]
+
+    @property
+    def n_uavs(self) -> int:
+        """Number of UAVs ``K``, padding included."""
+        return 1 if self.fleet is None else self.fleet.speed_m_s.shape[-1]
+
+    @property
+    def n_depots(self) -> int:
+        """Number of depots ``D``, padding included."""
+        return 0 if self.depots is None else self.depots.kind.shape[-1]
+
+    @property
+    def n_places(self) -> int:
+        """Number of places that a UAV can fly to, ``n + D``: the devices, then the depots."""
+        return self.n_devices + self.n_depots
+
+    @property
+    def action_shape(self) -> tuple[int, ...]:
+        """Shape of an action: ``()`` for one UAV, ``(K,)`` for a fleet."""
+        return () if self.n_uavs == 1 else (self.n_uavs,)
+
+    def places(self) -> Float[Array, "n_places 2"]:
+        """Return the positions of all places in m, without batch axes."""
+        return self.position if self.depots is None else jnp.concatenate([self.position, self.depots.position])
 
     def failure_price(self, seconds: Num[ArrayLike, ""]) -> Float[Array, " n"]:
         """Return the price of each device's first failure, in slots of lifetime, at a time as in :meth:`Traffic.at`."""
         if self.traffic is None:
             return jnp.zeros(self.capacity.shape)
         return self.traffic.price * self.traffic.at(seconds)
+
+
+def fleet_of(params: Params, layout: Layout) -> Fleet:
+    """Return the UAVs of a layout without batch axes; the one of the parameters is a fleet of one."""
+    if layout.fleet is not None:
+        return layout.fleet
+    fields = {name: jnp.asarray(getattr(params, f"uav_{name}"), jnp.float32)[None] for name in UAV_FIELDS}
+    return Fleet(**fields, start_m=default_start(1, layout.depots))
 
 
 def make_layout(
@@ -177,5 +221,5 @@ def pad_layout(layout: Layout, size: int) -> Layout:
     traffic = layout.traffic
     if traffic is not None:
         traffic = replace(traffic, weight=jnp.pad(jnp.asarray(traffic.weight), ((0, 0), (0, size - n))))
-    padded = jax.tree.map(pad, replace(layout, traffic=None, present=None))
-    return mask_absent(replace(padded, traffic=traffic), pad(present))
+    padded = jax.tree.map(pad, replace(layout, traffic=None, present=None, fleet=None, depots=None))
+    return mask_absent(replace(padded, traffic=traffic, fleet=layout.fleet, depots=layout.depots), pad(present))

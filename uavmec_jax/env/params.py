@@ -9,16 +9,20 @@ from jaxtyping import Array, Float
 
 from uavmec_jax.env.types import Range, Scalar
 
-MAX_DEVICES = 64
+MAX_DEVICES = 1000
 """Largest number of devices in a scenario."""
+
+ENDS = ("first_failure", "horizon")
+"""What ends an episode. ``first_failure``: an empty battery, expired data or the UAVs' batteries, as in the paper.
+``horizon``: a time or a share of the devices with empty batteries; devices fail one by one, and the others go on."""
 
 
 @struct.dataclass
 class Params:
     """Simulation parameters (paper, Table 1) in SI units: a frozen pytree whose leaves may all be traced.
 
-    The defaults are the paper's. Only ``n_devices`` is static, since it is a shape. The metadata of a field hold the
-    bounds that files must respect (at least 0 if there are none). The last group of fields chooses between
+    The defaults are the paper's. Only ``n_devices``, which is a shape, and ``end`` are static. The metadata of a field hold
+    the bounds that files must respect (at least 0 if there are none). The last group of fields chooses between
     interpretations where the paper is ambiguous; ``docs/model.md`` explains each.
     """
 
@@ -53,6 +57,12 @@ class Params:
     """Whether data expire when their age reaches the limit (``>=``), not when it exceeds it (``>``)."""
     max_slots: Scalar = struct.field(default=1000, metadata={"ge": 1, "le": 1_000_000})
     """Time limit of an episode (truncation), far beyond what the UAV's battery allows with the paper's parameters."""
+    end: str = struct.field(pytree_node=False, default="first_failure", metadata={"choices": ENDS})
+    """What ends an episode; see :data:`ENDS`."""
+    horizon_s: Scalar = struct.field(default=43_200.0, metadata={"gt": 0})
+    """Seconds after which an episode ends, if ``end`` is ``horizon``."""
+    end_share: Scalar = struct.field(default=1.0, metadata={"gt": 0, "le": 1})
+    """Share of the devices with an empty battery at which an episode ends, if ``end`` is ``horizon``."""
 
     @property
     def noise_power_w(self) -> Float[Array, "*batch"]:

@@ -8,18 +8,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
-from uavmec_jax.env.dynamics import Outcome, State
+from uavmec_jax.env.dynamics import Outcome, State, living_devices, service
 from uavmec_jax.env.layout import Layout
+from uavmec_jax.env.params import Params
 from uavmec_jax.env.types import Scalar
 
 TERMS: tuple[str, ...] = ("A", "U", "M", "O", "log A", "log U", "log M", "log O")
 """The terms of a reward, in the order of a weight vector.
 
-A: data age of the visited device before the visit. U: slots completed, this one included. M: lowest battery fraction
-after the slot. O: oldest data age before the visit.
+A: data age of the visited device before the visit, of a fleet the largest one. U: slots completed, this one included. M:
+lowest battery fraction after the slot. O: oldest data age before the visit. Devices whose battery was empty before the slot
+count in none of them.
 """
+
+SERVICE_TERM = "S"
+"""A ninth term: the share of the devices that work and whose data are fresh after the slot, weighted by priority."""
 
 LOG_GUARDS: tuple[str, ...] = ("clamp", "log1p")
 """How the logarithms treat zero: ``clamp`` is log(max(x, 1e-6)); ``log1p`` is log(x + 1) for the ages A and O."""
@@ -77,6 +82,7 @@ class Reward:
             lighter traffic (paper, section 5.1).
         traffic_penalty: subtracted, in the same proportion, for the device that fails first.
         per_slot: added for every slot that counts; alone, it makes the sum of the rewards the lifetime.
+        service: weight of the term :data:`SERVICE_TERM`; ``None``: it is not computed.
     """
 
     weights: Float[Array, "*batch 8"]
@@ -85,6 +91,7 @@ class Reward:
     traffic_bonus: Scalar = 0.0
     traffic_penalty: Scalar = 0.0
     per_slot: Scalar = 0.0
+    service: Scalar | None = None
 
 
 def make_reward(
@@ -98,8 +105,8 @@ def make_reward(
     """Make a :class:`Reward` from a name of Table 6, from custom weights, or from a function.
 
     Args:
-        reward: a name such as ``"U+log(A/O)"``; weights such as ``{"U": 1.0, "log A": 1.0}``; or a traceable function
-            from ``{term: scalar}`` to a scalar, such as ``lambda terms: terms["U"] * terms["M"]``.
+        reward: a name such as ``"U+log(A/O)"``; weights such as ``{"U": 1.0, "log A": 1.0, "S": 2.0}``; or a traceable
+            function from ``{term: scalar}`` to a scalar, such as ``lambda terms: terms["U"] * terms["M"]``.
         guard: one of :data:`LOG_GUARDS`.
         traffic_bonus: see :class:`Reward`; it has an effect in layouts with traffic.
         traffic_penalty: likewise.
@@ -119,67 +126,132 @@ def make_reward(
     if callable(reward):
         _check_function(reward)
         return Reward(weights=jnp.zeros(len(TERMS)), function=reward, **common)
+    service = None
     if isinstance(reward, str):
         if reward not in REWARDS:
             raise ValueError(f"unknown reward {reward!r}; rewards are {', '.join(REWARDS)}")
         weights = REWARDS[reward]
     else:
-        weights = make_weights(reward)
-    return Reward(weights=jnp.asarray(weights), **common)
+        weights = make_weights({term: weight for term, weight in reward.items() if term != SERVICE_TERM})
+        if SERVICE_TERM in reward:
+            service = jnp.float32(reward[SERVICE_TERM])
+    return Reward(weights=jnp.asarray(weights), service=service, **common)
 
 
 def _check_function(function: Callable[[Mapping[str, Any]], Any]) -> None:
     """Check that a reward function asks for known terms only and returns a scalar."""
     scalar = jax.ShapeDtypeStruct((), jnp.float32)
     try:
-        result = jax.eval_shape(lambda terms: jnp.asarray(function(terms)), dict.fromkeys(TERMS, scalar))
+        terms = dict.fromkeys((*TERMS, SERVICE_TERM), scalar)
+        result = jax.eval_shape(lambda terms: jnp.asarray(function(terms)), terms)
     except KeyError as error:
-        raise ValueError(f"the reward function asks for the term {error}; terms are {', '.join(TERMS)}") from None
+        known = ", ".join((*TERMS, SERVICE_TERM))
+        raise ValueError(f"the reward function asks for the term {error}; terms are {known}") from None
     if result.shape != ():
         raise ValueError(f"the reward function returns an array of shape {result.shape}; it should return a scalar")
 
 
 def needs_guard(reward: str | Mapping[str, float]) -> bool:
     """Return whether the guard makes a difference to a reward: only ``log A`` and ``log O`` depend on it."""
-    weights = REWARDS[reward] if isinstance(reward, str) else make_weights(reward)
+    if isinstance(reward, str):
+        weights = REWARDS[reward]
+    else:
+        weights = make_weights({term: weight for term, weight in reward.items() if term != SERVICE_TERM})
     return bool(weights[TERMS.index("log A")] or weights[TERMS.index("log O")])
 
 
+def check_guard(reward: Reward, layout: Layout) -> None:
+    """Check that a reward has no bare logarithm of an age if there are depots; traced rewards pass.
+
+    Raises:
+        ValueError: one line.
+    """
+    if not layout.n_depots or isinstance(reward.weights, jax.core.Tracer) or isinstance(reward.log1p, jax.core.Tracer):
+        return
+    ages = np.asarray(reward.weights)[..., [TERMS.index("log A"), TERMS.index("log O")]]
+    if np.any(np.any(ages != 0, axis=-1) & ~np.asarray(reward.log1p)):
+        raise ValueError(
+            "the reward has log A or log O, and there are depots, where no age is visited; take guard='log1p'"
+        )
+
+
 def reward_terms(
-    layout: Layout, before: State, action: Int[ArrayLike, ""], after: State, log1p: Scalar = False
+    layout: Layout,
+    before: State,
+    action: Int[ArrayLike, ""] | Int[Array, " K"],
+    after: State,
+    log1p: Scalar = False,
+    living: Bool[Array, " n"] | None = None,
 ) -> Float[Array, "8"]:
-    """Return the eight :data:`TERMS` of one slot from the states before and after it."""
-    visited_age = before.age[action].astype(jnp.float32)
-    oldest_age = jnp.max(before.age).astype(jnp.float32)
+    """Return the eight :data:`TERMS` of one slot from the states before and after it.
+
+    ``living`` are the devices that worked when the slot began; ``None``: all did.
+    """
+    visited_age = _largest_at_targets(layout, before, action, before.age, living).astype(jnp.float32)
+    counted = lambda value, otherwise: value if living is None else jnp.where(living, value, otherwise)  # noqa: E731
+    oldest_age = jnp.max(counted(before.age, 0)).astype(jnp.float32)
     slots = after.slot.astype(jnp.float32)
-    lowest_battery = jnp.min(after.battery / layout.capacity)
+    lowest_battery = jnp.min(counted(after.battery / layout.capacity, jnp.inf))
+    if living is not None:
+        lowest_battery = jnp.where(jnp.any(living), lowest_battery, 0.0)
     plain = jnp.stack([visited_age, slots, lowest_battery, oldest_age])
     is_age = np.array([True, False, False, True])
     guarded = jnp.where(log1p & is_age, plain + 1.0, jnp.maximum(plain, _SMALLEST))
     return jnp.concatenate([plain, jnp.log(guarded)])
 
 
+def _largest_at_targets(
+    layout: Layout,
+    before: State,
+    action: Int[ArrayLike, ""] | Int[Array, " K"],
+    value: Num[Array, " n"],
+    living: Bool[Array, " n"] | None,
+) -> Num[Array, ""]:
+    """Return the largest value among the living devices that UAVs fly to, able to pay or not; 0 without any."""
+    if layout.n_uavs == 1 and not layout.n_depots and living is None:
+        return value[jnp.reshape(jnp.asarray(action), ())]
+    n, target = layout.n_devices, jnp.reshape(jnp.asarray(action), (layout.n_uavs,))
+    counts = (target < n) & ~before.grounded
+    device = jnp.clip(target, 0, n - 1)
+    counts = counts if living is None else counts & living[device]
+    return jnp.max(jnp.where(counts, value[device], 0))
+
+
 def reward_of(
-    reward: Reward, layout: Layout, before: State, action: Int[ArrayLike, ""], after: State
+    reward: Reward,
+    layout: Layout,
+    before: State,
+    action: Int[ArrayLike, ""] | Int[Array, " K"],
+    after: State,
+    params: Params | None = None,
 ) -> Float[Array, ""]:
-    """Return the reward of one slot, without traffic."""
-    terms = reward_terms(layout, before, action, after, reward.log1p)
+    """Return the reward of one slot, without traffic; all UAVs share it. By default, ``params`` are the paper's."""
+    params = Params() if params is None else params
+    terms = reward_terms(layout, before, action, after, reward.log1p, living_devices(params, layout, before))
     survival = reward.per_slot * (after.slot - before.slot)
     if reward.function is not None:
-        return jnp.asarray(reward.function(dict(zip(TERMS, terms, strict=True))), jnp.float32) + survival
-    return jnp.dot(reward.weights, terms) + survival
+        named = dict(zip(TERMS, terms, strict=True)) | {SERVICE_TERM: service(params, layout, after)}
+        return jnp.asarray(reward.function(named), jnp.float32) + survival
+    total = jnp.dot(reward.weights, terms) + survival
+    return total if reward.service is None else total + reward.service * service(params, layout, after)
 
 
 def traffic_reward(
-    reward: Reward, layout: Layout, before: State, action: Int[ArrayLike, ""], outcome: Outcome
+    reward: Reward,
+    layout: Layout,
+    before: State,
+    action: Int[ArrayLike, ""] | Int[Array, " K"],
+    outcome: Outcome,
+    living: Bool[Array, " n"] | None = None,
 ) -> Float[Array, ""]:
     """Return what traffic adds to the reward of one slot; 0 for a layout without traffic.
 
     It is ``traffic_bonus * w[action] - traffic_penalty * sum(first_failure * w)``, where ``w`` are the devices' traffic
-    weights when the slot begins.
+    weights when the slot begins; of the targets of a fleet the largest weight counts.
     """
     if layout.traffic is None:
         return jnp.zeros(())
     weight = layout.traffic.at(before.elapsed)
     failed_weight = jnp.dot(outcome.first_failure, weight)
-    return jnp.asarray(reward.traffic_bonus * weight[action] - reward.traffic_penalty * failed_weight, jnp.float32)
+    visited_weight = _largest_at_targets(layout, before, action, weight, living)
+    return jnp.asarray(reward.traffic_bonus * visited_weight - reward.traffic_penalty * failed_weight, jnp.float32)

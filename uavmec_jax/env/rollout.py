@@ -1,20 +1,22 @@
 """Episodes: every policy, learned or not, is evaluated by these loops."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key, PRNGKeyArray
 
-from uavmec_jax.env.dynamics import Cause, Outcome, State, initial_state, transition
+from uavmec_jax.env.dynamics import Cause, Outcome, State, complete_state, initial_state, service, transition
 from uavmec_jax.env.generator import ScenarioDistribution, scenario_from_draw
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.scenario import Scenario, advance, draw_volumes
 
 Policy = Callable[..., Array]
-"""``policy(params, layout, state, key=None) -> action``, int32 in ``[0, n)``; pure, works under ``jit`` and ``vmap``."""
+"""``policy(params, layout, state, key=None) -> action``, an int32 place in ``[0, n + D)``, one per UAV (``[K]``) if there
+are several; pure, works under ``jit`` and ``vmap``."""
 
 _POLICY_STREAM = 2**32 - 1
 """``fold_in`` number of the policy's randomness; the volumes of slot ``t`` have the number ``t``."""
@@ -29,12 +31,15 @@ class Episode:
         cause: why it ended, a :class:`Cause` as int32; ``NONE`` if the time limit ended it.
         failed: devices that failed in the last slot.
         first_failure: each device's share in the first failure; sums to 1 unless no device failed.
+        service_s: with ``end = "horizon"``, seconds in which the devices were in service (:func:`dynamics.service`), mean
+            over the devices weighted by their priorities; else ``None``.
     """
 
     length: Int[Array, "*batch"]
     cause: Int[Array, "*batch"]
     failed: Bool[Array, "*batch n"]
     first_failure: Float[Array, "*batch n"]
+    service_s: Float[Array, "*batch"] | None = None
 
 
 def slot_volumes(params: Params, n_devices: int, key: PRNGKeyArray, slot: Int[ArrayLike, ""]) -> Float[Array, " n"]:
@@ -67,31 +72,56 @@ def rollout_from(policy: Policy, params: Params, layout: Layout, state: State, k
 
 def rollout_with_actions(
     policy: Policy, params: Params, layout: Layout, key: PRNGKeyArray, slots: int
-) -> tuple[Int[Array, " slots"], Episode]:
-    """Play one episode as :func:`rollout` does and return the devices visited in its first slots, -1 after its end."""
+) -> tuple[Int[Array, "slots *K"], Episode]:
+    """Play one episode as :func:`rollout` does and return the actions in its first slots, -1 after its end."""
     return _play(policy, params, layout, initial_state(params, layout), key, slots)
+
+
+class _Progress(NamedTuple):
+    """An episode so far: the state, the outcome of the last slot, the first actions, and with a horizon, its tally."""
+
+    state: State
+    outcome: Outcome
+    actions: Int[Array, "slots *K"]
+    first_failure: Float[Array, " n"] | None
+    service_s: Float[Array, ""] | None
 
 
 def _play(
     policy: Policy, params: Params, layout: Layout, state: State, key: PRNGKeyArray, slots: int
-) -> tuple[Int[Array, " slots"], Episode]:
+) -> tuple[Int[Array, "slots *K"], Episode]:
     """Play an episode from ``state`` to its end; return the first ``slots`` actions and the result."""
     play_slot = _make_play_slot(policy, params, layout, key)
 
-    def is_running(carry: tuple[State, Outcome, Array]) -> Bool[Array, ""]:
-        return _is_running(params, *carry[:2])
-
-    def next_slot(carry: tuple[State, Outcome, Array]) -> tuple[State, Outcome, Array]:
-        state, _, actions = carry
+    def next_slot(progress: _Progress) -> _Progress:
+        state, first_failure, service_s = progress.state, progress.first_failure, progress.service_s
         action, after, outcome = play_slot(state)
-        return after, outcome, actions.at[state.slot].set(action, mode="drop") if slots else actions
+        actions = progress.actions.at[state.slot].set(action, mode="drop") if slots else progress.actions
+        if first_failure is not None and service_s is not None:
+            first_failure = jnp.where(jnp.any(first_failure > 0), first_failure, outcome.first_failure)
+            service_s = service_s + outcome.duration * service(params, layout, after)
+        return _Progress(after, outcome, actions, first_failure, service_s)
 
-    start = (state, _initial_outcome(layout.capacity.shape[0]), jnp.full(slots, -1, jnp.int32))
-    state, outcome, actions = jax.lax.while_loop(is_running, next_slot, start)
-    episode = Episode(
-        length=state.slot, cause=outcome.cause, failed=outcome.failed, first_failure=outcome.first_failure
+    goes_on = params.end == "horizon"
+    last = jax.lax.while_loop(
+        lambda progress: _is_running(params, progress.state, progress.outcome),
+        next_slot,
+        _Progress(
+            state=complete_state(layout, state),
+            outcome=_initial_outcome(layout.n_devices),
+            actions=jnp.full((slots, *layout.action_shape), -1, jnp.int32),
+            first_failure=jnp.zeros(layout.n_devices) if goes_on else None,
+            service_s=jnp.zeros(()) if goes_on else None,
+        ),
     )
-    return actions, episode
+    episode = Episode(
+        length=last.state.slot,
+        cause=last.outcome.cause,
+        failed=last.outcome.failed,
+        first_failure=last.outcome.first_failure if last.first_failure is None else last.first_failure,
+        service_s=last.service_s,
+    )
+    return last.actions, episode
 
 
 def _is_running(params: Params, state: State, outcome: Outcome) -> Bool[Array, ""]:
@@ -122,7 +152,7 @@ def _make_act_and_volumes(
         return policy(params, layout, state, jax.random.fold_in(policy_key, state.slot))
 
     def volumes(state: State) -> Float[Array, " n"]:
-        return slot_volumes(params, layout.capacity.shape[0], key, state.slot)
+        return slot_volumes(params, layout.n_devices, key, state.slot)
 
     return act, volumes
 
@@ -157,7 +187,7 @@ def returns(policy: Policy, scenario: Scenario, keys: Key[Array, " D"]) -> Float
         def is_running(carry: tuple[State, Outcome, Array]) -> Bool[Array, ""]:
             return _is_running(scenario.params, *carry[:2])
 
-        outcome = _initial_outcome(scenario.layout.capacity.shape[0])
+        outcome = _initial_outcome(scenario.layout.n_devices)
         start = (initial_state(scenario.params, scenario.layout), outcome, jnp.zeros(()))
         return jax.lax.while_loop(is_running, next_slot, start)[2]
 
@@ -170,13 +200,13 @@ class Trace:
 
     Attributes:
         played: whether the slot belongs to the episode.
-        action: device visited, int32.
+        action: place of each UAV, int32, as policies return it.
         state: the state after each slot, leaves ``[H, ...]``.
         outcome: the outcome of each slot, leaves ``[H, ...]``.
     """
 
     played: Bool[Array, "*batch"]
-    action: Int[Array, "*batch"]
+    action: Int[Array, "*batch_K"]
     state: State
     outcome: Outcome
 
@@ -191,11 +221,11 @@ def trace(policy: Policy, params: Params, layout: Layout, key: PRNGKeyArray, slo
         state, outcome = jax.tree.map(lambda new, old: jnp.where(played, new, old), tuple(new), carry)
         return (state, outcome), Trace(played=played, action=action, state=state, outcome=outcome)
 
-    start = (initial_state(params, layout), _initial_outcome(layout.capacity.shape[0]))
+    start = (initial_state(params, layout), _initial_outcome(layout.n_devices))
     return jax.lax.scan(play_if, start, None, length=slots)[1]
 
 
-def tour_policy(actions: Int[Array, " H"]) -> Policy:
+def tour_policy(actions: Int[Array, "H *K"]) -> Policy:
     """Return the policy that follows a fixed tour: in each slot it takes ``actions[slot]``."""
     return lambda params, layout, state, key=None: actions[state.slot]
 

@@ -1,14 +1,16 @@
 """Scenarios, and one slot of a scenario with its reward."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from uavmec_jax.env.dynamics import Cause, Outcome, State, initial_state, transition
+from uavmec_jax.env.dynamics import Cause, Outcome, State, initial_state, living_devices, transition
 from uavmec_jax.env.layout import Layout, sample_layout
 from uavmec_jax.env.params import Params
-from uavmec_jax.env.rewards import Reward, make_reward, reward_of, traffic_reward
+from uavmec_jax.env.rewards import Reward, check_guard, make_reward, reward_of, traffic_reward
 
 
 @struct.dataclass
@@ -33,12 +35,18 @@ def make_scenario(layout: Layout | None = None, params: Params | None = None, re
         layout: by default a random layout in which two thirds of the devices have power and two thirds communication.
         params: by default those of the paper.
         reward: by default the one that the paper found best.
+
+    Raises:
+        ValueError: there are depots, and the reward has a bare logarithm of an age, which is 0 at a depot.
     """
     params = Params() if params is None else params
     if layout is None:
         count = (2 * params.n_devices) // 3
         layout = sample_layout(jax.random.key(0), params, count, count)
-    return Scenario(params=params, layout=layout, reward=make_reward() if reward is None else reward)
+    if reward is None:
+        reward = make_reward(guard="log1p" if layout.n_depots else "clamp")
+    check_guard(reward, layout)
+    return Scenario(params=params, layout=layout, reward=reward)
 
 
 def draw_volumes(params: Params, uniform: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -48,13 +56,18 @@ def draw_volumes(params: Params, uniform: Float[Array, "*shape"]) -> Float[Array
 
 
 def advance(
-    scenario: Scenario, state: State, action: Int[ArrayLike, ""], volumes: Float[Array, " n"]
+    scenario: Scenario,
+    state: State,
+    action: Int[ArrayLike, ""] | Int[Array, " K"],
+    volumes: Float[Array, " n"],
 ) -> tuple[State, Float[Array, ""], Outcome]:
     """Play one slot with explicit volumes, without a reset, and return the next state, the reward and the outcome."""
     after, outcome = transition(scenario.params, scenario.layout, state, action, volumes)
-    reward = reward_of(scenario.reward, scenario.layout, state, action, after)
-    if scenario.layout.traffic is not None:  # known when tracing: other layouts do not pay for it
-        reward += traffic_reward(scenario.reward, scenario.layout, state, action, outcome)
+    params, layout = scenario.params, scenario.layout
+    reward = reward_of(scenario.reward, layout, state, action, after, params)
+    if layout.traffic is not None:  # known when tracing: other layouts do not pay for it
+        living = living_devices(params, layout, state)
+        reward += traffic_reward(scenario.reward, layout, state, action, outcome, living)
     return after, reward, outcome
 
 
@@ -66,4 +79,10 @@ def is_truncated(scenario: Scenario, state: State, outcome: Outcome) -> Bool[Arr
 def auto_reset(ended: Bool[Array, ""], scenario: Scenario, state: State) -> State:
     """Return the initial state if the episode has ended, else ``state``."""
     fresh = initial_state(scenario.params, scenario.layout)
+    if (
+        scenario.params.end == "first_failure"
+    ):  # where an episode goes on, nothing has failed: the loop carries constants
+        state = replace(state, failed_at=fresh.failed_at)
+        if not scenario.layout.action_shape and not scenario.layout.n_depots:
+            state = replace(state, grounded=fresh.grounded, packs=fresh.packs)
     return jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, state)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from uavmec_jax.env.dynamics import State, initial_state
+from uavmec_jax.env.dynamics import State, complete_state, initial_state
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Episode, Policy, rollout_from
@@ -88,6 +88,7 @@ def advise(
     """
     state = initial_state(params, layout) if state is None else state
     chex.assert_equal_shape([state.battery, state.age, layout.capacity])
+    state = complete_state(layout, state)
     futures = jax.random.split(jax.random.key(0) if key is None else key, samples)
     choice, episodes = _try_candidates(policy, params, layout, state, futures)
     lifetimes = np.asarray(episodes.length, float)

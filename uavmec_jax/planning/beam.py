@@ -217,7 +217,7 @@ def _advance(problem: _Problem, target: Int[Array, ""], width: int, beam: _Beam)
     improved = lifetimes[best] > beam.lifetime
 
     survives = (beam.alive[:, None] & (outcome.cause == Cause.NONE) & (after.slot < params.max_slots)).reshape(-1)
-    after = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), after)
+    after = jax.tree.map(lambda leaf: leaf.reshape(width * n, *leaf.shape[2:]), after)
     score = jnp.where(survives, _score(problem, beam.slot + 1, target, after), -jnp.inf)
     # The dominance test gets half as many states again, so that those it removes leave no gaps in the beam.
     score, chosen = jax.lax.top_k(score, min(width + width // 2, n * width))
@@ -258,7 +258,7 @@ def _score(problem: _Problem, slot: Int[Array, ""], target: Int[Array, ""], stat
     index = jnp.arange(problem.volumes.shape[0])
     paid = (index >= slot) & (index < target - jnp.where(params.count_unfinished_slot, 1, 0))
     hovering = base * jnp.sum(jnp.where(paid, jnp.min(problem.costs.duration, axis=1), 0.0))
-    spare = states.uav_energy * (1.0 + 1e-5) - hovering
+    spare = states.uav_energy[:, 0] * (1.0 + 1e-5) - hovering
     expiry = jnp.maximum(slots_to_expiry(params), 1)
     flights = extra * problem.round_length / params.uav_speed_m_s * remaining / expiry
 
@@ -295,7 +295,7 @@ def _dominated(
     """
     age = jnp.where(layout.has_comms, 0, states.age).astype(jnp.float32)
     battery = jnp.where(layout.has_power, 0.0, states.battery)
-    criteria = jnp.concatenate([-age, battery, states.uav_energy[:, None]], axis=1)
+    criteria = jnp.concatenate([-age, battery, states.uav_energy], axis=1)
     columns, rank = criteria.T, jnp.arange(hover_point.shape[0])
 
     # One state against all others at a time, criteria in rows: eight times as fast as all pairs at once.

@@ -36,7 +36,7 @@ def earliest_deadline(params: Params, layout: Layout, state: State, key: PRNGKey
     mean = demand.mean_slot(params, layout)
     slots, services = feasible_horizon(params, layout, state, mean, demand.visit_shares(layout, covers))
 
-    distance = jnp.linalg.norm(layout.position - state.uav_position, axis=-1)
+    distance = jnp.linalg.norm(layout.position - state.uav_position[0], axis=-1)
     deadline = _deadlines(params, layout, state, covers, slots)
     freshness = jnp.argmin(deadline + _TIE_PER_M * distance)
 
@@ -90,7 +90,7 @@ def feasible_horizon(
     def fits(slots: Float[Array, ""]) -> Bool[Array, ""]:
         age_visits, _ = demand.age_visits(params, layout, state.age, slots)
         visits = jnp.maximum(services(slots), age_visits)
-        uav_lasts = slots * base * shortest <= state.uav_energy
+        uav_lasts = slots * base * shortest <= state.uav_energy[0]
         return (visits @ visit_share <= slots) & jnp.all(visits <= slots) & uav_lasts
 
     # Bisection: if the visits fit into a number of slots, then also those for fewer slots.

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
-from uavmec_jax.env.dynamics import slots_to_expiry, upload_rate
+from uavmec_jax.env.channel import upload_rate
+from uavmec_jax.env.dynamics import slots_to_expiry
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from uavmec_jax.env.dynamics import Cause, State, initial_state
+from uavmec_jax.env.dynamics import Cause, State, complete_state, initial_state
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Episode, Policy, rollout_from
@@ -80,7 +80,7 @@ def make_forecast(
         key: of the futures' task volumes; by default the same in every call.
         samples: number of futures.
     """
-    state = initial_state(params, layout) if state is None else state
+    state = initial_state(params, layout) if state is None else complete_state(layout, state)
     futures = jax.random.split(jax.random.key(0) if key is None else key, samples)
     return Forecast.of(_simulate(policy, params, layout, state, futures))
 

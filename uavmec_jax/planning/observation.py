@@ -199,7 +199,7 @@ def _visit_features(
 ) -> dict[str, Array]:
     """Return what a visit to each device costs and which devices it serves."""
     duration = derived.mean.duration
-    t_fly = jnp.linalg.norm(layout.position - state.uav_position, axis=-1) / params.uav_speed_m_s
+    t_fly = jnp.linalg.norm(layout.position - state.uav_position[0], axis=-1) / params.uav_speed_m_s
     base, extra = demand.flight_power(params)
     served = derived.covers & (~layout.has_power | ~layout.has_comms)
     oldest = jnp.max(jnp.where(derived.covers, _counted_age(layout, state), 0.0), axis=1)
@@ -209,7 +209,7 @@ def _visit_features(
         "together": jnp.sum(served, axis=1) / 4.0,
         "oldest_served": oldest / derived.expiry,
         "slot_length": duration / jnp.maximum(jnp.max(jnp.where(mask, duration, 0.0)), 1e-3),
-        "uav_use": jnp.minimum((base * duration + extra * t_fly) / jnp.maximum(state.uav_energy, 1.0), 1.0),
+        "uav_use": jnp.minimum((base * duration + extra * t_fly) / jnp.maximum(state.uav_energy[0], 1.0), 1.0),
     }
 
 
@@ -246,7 +246,7 @@ def _shared_features(
 ) -> dict[str, Array]:
     """Return the features that are the same for all devices."""
     base, _ = demand.flight_power(params)
-    uav_slots = state.uav_energy / jnp.maximum(base * jnp.min(derived.mean.duration), 1e-3)
+    uav_slots = state.uav_energy[0] / jnp.maximum(base * jnp.min(derived.mean.duration), 1e-3)
     age_visits, _ = demand.age_visits(params, layout, state.age, slots)
     needed = order_independent_sum(jnp.maximum(services, age_visits) * derived.visit_share)
     deadline = _deadlines(params, layout, state.age)

@@ -53,11 +53,11 @@ def map_pixels(scenario: Scenario, state: State, visited: int | None = None) -> 
         labels += [] if layout.has_comms[device] else [f"age {int(state.age[device])}"]
         text = ", ".join(labels)
         axis.annotate(text, position, xytext=(0, -14), textcoords="offset points", ha="center", fontsize=7)
-    x, y = np.asarray(state.uav_position)
+    (x, y), energy = np.asarray(state.uav_position)[0], float(np.asarray(state.uav_energy)[0])
     axis.plot(x, y, marker="X", color="black", ls="", ms=9, alpha=0.7, label="UAV", zorder=4)
     if visited is not None:
         axis.plot(x, y, marker="o", mfc="none", mec="black", ls="", ms=18, zorder=4)
-    axis.set_title(f"slot {int(state.slot)}, UAV {float(state.uav_energy) / 1000:.0f} kJ", fontsize=10)
+    axis.set_title(f"slot {int(state.slot)}, UAV {energy / 1000:.0f} kJ", fontsize=10)
     axis.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1, 1))
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()

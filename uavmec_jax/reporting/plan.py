@@ -92,7 +92,7 @@ def slot_rows(plan: Plan, names: Sequence[str], tour: Trace) -> list[dict[str, A
             "flight_m": float(flights[slot]),
             "served": [int(device) + 1 for device in np.flatnonzero(tour.outcome.served[slot])],
             "duration_s": float(tour.outcome.duration[slot]),
-            "uav_energy_j": float(tour.state.uav_energy[slot]),
+            "uav_energy_j": float(tour.state.uav_energy[slot, 0]),
             "lowest_battery": {
                 "device": int(fraction[slot].argmin()) + 1,
                 "fraction": float(fraction[slot].min()),

@@ -10,7 +10,7 @@ import pydantic
 from jaxtyping import Int, Num
 from pydantic import Field
 
-from uavmec_jax.env.dynamics import State, slots_to_expiry
+from uavmec_jax.env.dynamics import State, complete_state, slots_to_expiry
 from uavmec_jax.errors import StateError
 from uavmec_jax.files.reading import read_text
 from uavmec_jax.files.validation import StrictModel, describe_error, from_array
@@ -84,14 +84,15 @@ def _build(file: StateFile, scenario: NamedScenario) -> State:
     energy = uav_battery if file.uav_energy_j is None else file.uav_energy_j
     if not 0 < energy <= uav_battery * (1 + 1e-6):
         raise ValueError(f"uav_energy_j is {energy:g}; give more than 0 and at most {uav_battery:g}")
-    return State(
+    state = State(
         battery=jnp.asarray(np.minimum(battery, capacity), jnp.float32),
         age=jnp.where(scenario.layout.has_comms, 0, jnp.asarray(age, jnp.int32)),
-        uav_position=jnp.asarray(_uav_position(file, scenario), jnp.float32),
-        uav_energy=jnp.float32(min(energy, uav_battery)),
+        uav_position=jnp.asarray(_uav_position(file, scenario), jnp.float32)[None],
+        uav_energy=jnp.float32(min(energy, uav_battery))[None],
         slot=jnp.int32(file.slot),
         elapsed=jnp.float32(file.elapsed_s),
     )
+    return complete_state(scenario.layout, state)
 
 
 def _check_devices(battery: Num[np.ndarray, " n"], age: Int[np.ndarray, " n"], scenario: NamedScenario) -> None:
@@ -148,8 +149,8 @@ def state_data(scenario: NamedScenario) -> dict[str, Any]:
     return {
         "battery_j": {name: round(float(energy), 3) for name, energy in zip(names, battery, strict=True)},
         "age_slots": {name: int(slots) for name, slots in zip(names, age, strict=True)},
-        "uav_position_m": [round(float(x), 3) for x in np.asarray(state.uav_position)],
-        "uav_energy_j": round(float(state.uav_energy), 3),
+        "uav_position_m": [round(float(x), 3) for x in np.asarray(state.uav_position)[0]],
+        "uav_energy_j": round(float(state.uav_energy[0]), 3),
         "slot": int(state.slot),
         "elapsed_s": round(float(state.elapsed), 3),
     }

@@ -1,0 +1,160 @@
+"""Fleets and depots: the UAVs of a scenario, and the places where they swap or charge their batteries."""
+
+import enum
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from uavmec_jax.env.params import Params
+
+MAX_UAVS = 100
+"""Largest number of UAVs in a scenario."""
+
+DEPOT_POWER_W = 667.0
+"""Default power of a charging depot, W: it charges the paper's UAV in 40 minutes."""
+
+
+class DepotKind(enum.IntEnum):
+    """What a depot does for a UAV that has landed there."""
+
+    SWAP = 0
+    """It swaps the battery for a full one, while it has packs."""
+    CHARGE = 1
+    """It charges the battery for the rest of the slot."""
+
+
+@struct.dataclass
+class Fleet:
+    """The UAVs of a scenario; every field has one entry per UAV.
+
+    Attributes:
+        speed_m_s: m/s.
+        flying_power_w: W.
+        hovering_power_w: W.
+        battery_j: battery capacity, J.
+        signal_range_m: largest slant distance at which a device is served, m.
+        start_m: position at the start, m.
+        present: which entries are UAVs and not padding; ``None`` if all are. Padding is grounded from the start.
+    """
+
+    speed_m_s: Float[Array, "*batch K"]
+    flying_power_w: Float[Array, "*batch K"]
+    hovering_power_w: Float[Array, "*batch K"]
+    battery_j: Float[Array, "*batch K"]
+    signal_range_m: Float[Array, "*batch K"]
+    start_m: Float[Array, "*batch K 2"]
+    present: Bool[Array, "*batch K"] | None = None
+
+
+@struct.dataclass
+class Depots:
+    """The depots of a scenario; every field has one entry per depot.
+
+    Attributes:
+        position: coordinates in the region, m.
+        kind: a :class:`DepotKind`.
+        pads: UAVs that are served in one slot, the lowest numbers first; the others wait. Padding has none.
+        packs: full batteries in stock at the start; only swapping takes them.
+        power_w: power per UAV of a charging depot, W.
+    """
+
+    position: Float[Array, "*batch D 2"]
+    kind: Int[Array, "*batch D"]
+    pads: Float[Array, "*batch D"]
+    packs: Float[Array, "*batch D"]
+    power_w: Float[Array, "*batch D"]
+
+
+UAV_FIELDS = ("speed_m_s", "flying_power_w", "hovering_power_w", "battery_j", "signal_range_m")
+"""Fields of a :class:`Fleet` whose defaults are the parameters of the same name behind ``uav_``."""
+
+
+def make_fleet(params: Params, uavs: int, depots: Depots | None = None, **values: ArrayLike) -> Fleet:
+    """Return a fleet of ``uavs`` UAVs like that of the parameters, except for the given values.
+
+    Args:
+        params: simulation parameters.
+        uavs: number of UAVs, at least 1.
+        depots: UAV ``v`` starts at depot ``v mod D``; without depots, at the origin.
+        values: fields of :class:`Fleet`, a number for all UAVs or one per UAV; e.g. ``battery_j=[1.6e6, 0.8e6]``.
+
+    Raises:
+        ValueError: a number is out of range, one line that names the field.
+        TypeError: a name is not one of a field.
+    """
+    if not 1 <= uavs <= MAX_UAVS:
+        raise ValueError(f"uavs is {uavs}; give 1 to {MAX_UAVS}")
+    start = default_start(uavs, depots) if (given := values.pop("start_m", None)) is None else given
+    present = values.pop("present", None)
+    defaults: dict[str, Any] = {name: getattr(params, f"uav_{name}") for name in UAV_FIELDS}
+    if unknown := set(values) - set(defaults):
+        raise TypeError(f"{sorted(unknown)[0]} is not a field of a fleet; fields are {', '.join(UAV_FIELDS)}, start_m")
+    fields = {
+        name: jnp.broadcast_to(jnp.asarray(value, jnp.float32), (uavs,)) for name, value in (defaults | values).items()
+    }
+    for name, value in fields.items():
+        lowest = 0.0 if name == "flying_power_w" else math.nextafter(0.0, 1.0)
+        _check(name, value, "UAV", "positive" if lowest else "at least 0", lambda v, low=lowest: v >= low)
+    return Fleet(
+        **fields,
+        start_m=jnp.broadcast_to(jnp.asarray(start, jnp.float32), (uavs, 2)),
+        present=None if present is None else jnp.asarray(present, bool),
+    )
+
+
+def make_depots(
+    position: Sequence[Sequence[float]] | Float[ArrayLike, "D 2"],
+    kind: str | Sequence[str] = "swap",
+    pads: ArrayLike = math.inf,
+    packs: ArrayLike = math.inf,
+    power_w: ArrayLike = DEPOT_POWER_W,
+) -> Depots:
+    """Return depots; each argument but the positions is one value for all or one per depot.
+
+    Args:
+        position: ``[D, 2]`` m.
+        kind: ``"swap"`` or ``"charge"``.
+        pads: UAVs that are served in one slot.
+        packs: full batteries in stock.
+        power_w: charging power per UAV, W.
+
+    Raises:
+        ValueError: a kind is unknown or a number is out of range, one line that names the field.
+    """
+    position = jnp.asarray(position, jnp.float32).reshape(-1, 2)
+    count = position.shape[0]
+    kinds = [kind] * count if isinstance(kind, str) else list(kind)
+    names = [member.name.lower() for member in DepotKind]
+    for number, name in enumerate(kinds, 1):
+        if name not in names:
+            raise ValueError(f"kind of depot {number} is {name!r}; give {' or '.join(map(repr, names))}")
+    numbers = {
+        name: jnp.broadcast_to(jnp.asarray(value, jnp.float32), (count,))
+        for name, value in (("pads", pads), ("packs", packs), ("power_w", power_w))
+    }
+    _check("pads", numbers["pads"], "depot", "at least 1", lambda value: value >= 1)
+    for name in ("packs", "power_w"):
+        _check(name, numbers[name], "depot", "at least 0", lambda value: value >= 0)
+    return Depots(position=position, kind=jnp.asarray([names.index(name) for name in kinds], jnp.int32), **numbers)
+
+
+def default_start(uavs: int, depots: Depots | None) -> Float[Array, "K 2"]:
+    """Return where UAVs start if nothing else is said: UAV ``v`` at depot ``v mod D``; without depots, at the origin."""
+    if depots is None or depots.kind.shape[-1] == 0:
+        return jnp.zeros((uavs, 2), jnp.float32)
+    return depots.position[np.arange(uavs) % depots.kind.shape[-1]]
+
+
+def _check(name: str, values: Array, vehicle: str, expected: str, fits: Any) -> None:
+    """Check values that are known; traced ones are the caller's responsibility."""
+    if isinstance(values, jax.core.Tracer):
+        return
+    for number, value in enumerate(np.asarray(values).tolist(), 1):
+        if math.isnan(value) or not fits(value):
+            raise ValueError(f"{name} of {vehicle} {number} is {value:g}; it should be {expected}")
