@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import pytest
 from numpy.testing import assert_allclose
 
-from tests.env.small_fleets import DEVICE_0, HORIZON, NORTH, PARAMS, VOLUMES, fleet_layout
-from uavmec_jax.env.dynamics import initial_state, transition
+from tests.env.small_fleets import DEVICE_0, HORIZON, NORTH, PARAMS, SLOW, VOLUMES, fleet_layout
+from uavmec_jax.env.dynamics import initial_state, living_devices, transition
 from uavmec_jax.env.fleet import make_depots
 from uavmec_jax.env.layout import Traffic
 from uavmec_jax.env.rewards import make_reward, reward_of, traffic_reward
@@ -44,10 +44,17 @@ def test_a_is_the_largest_age_among_the_living_targets(action, changes, expected
 
 
 def test_places_out_of_range_are_the_nearest_for_the_reward_too():
-    layout = fleet_layout(2)
-    before = state(layout=layout, age=[3, 5, 9])
-    assert value("A", before, [0, 99], layout=layout) == 9
-    assert value("A", before, [-1, -7], layout=layout) == 3
+    for params in (PARAMS, HORIZON):
+        for layout in (SLOW, fleet_layout(1), fleet_layout(2)):
+            before = state(params, layout, age=[3, 5, 9])
+            uavs = layout.n_uavs
+            assert value("A", before, [99] * uavs, layout=layout, params=params) == 9
+            assert value("A", before, [-1] * uavs, layout=layout, params=params) == 3
+
+
+def test_what_a_state_leaves_out_has_not_happened():
+    bare = state(age=[3, 5, 9]).replace(grounded=None, failed_at=None, packs=None)
+    assert [float(value(term, bare, [0, 1])) for term in "AOMS"] == [5, 9, 1, 1]
 
 
 @pytest.mark.parametrize(("failed_at", "expected"), [([-1, -1, -1], 9), ([-1, -1, 2], 5), ([1, 1, 2], 0)])
@@ -109,11 +116,14 @@ def test_the_traffic_bonus_takes_the_largest_weight_among_the_same_targets():
         ([0, 1], {}, 9.0),
         ([0, 2], {}, 6.0),
         ([0, 1], {"grounded": [False, True]}, 2.0),
+        ([0, 1], {"failed_at": [-1, 2, -1]}, 2.0),
         ([3, 3], {}, 0.0),
     ]:
         before = state(layout=layout, **changes)
         _, outcome = transition(HORIZON, layout, before, jnp.array(action), VOLUMES)
-        assert_allclose(traffic_reward(reward, layout, before, jnp.array(action), outcome), expected, rtol=1e-6)
+        living = living_devices(HORIZON, layout, before)
+        found = traffic_reward(reward, layout, before, jnp.array(action), outcome, living)
+        assert_allclose(found, expected, rtol=1e-6)
 
 
 def test_the_terms_of_one_uav_are_those_of_the_paper():

@@ -82,7 +82,6 @@ def test_a_uav_that_cannot_pay_is_charged_at_a_depot_and_grounded_elsewhere():
     # UAV 0 cannot pay 110 s of flight to device 2, 16,500 J. UAV 1 stays at device 0; device 2 computes: T = 300 s.
     layout = fleet_layout(2, make_depots([ORIGIN], kind="charge"))
     state, outcome = play(layout, [2, 0], at=[ORIGIN, DEVICE_0], uav_energy=[1000.0, FULL])
-    assert_array_equal(outcome.started, [False, True])
     assert_array_equal(state.grounded, [False, False])
     assert_allclose(state.uav_energy, [1000 + 667 * 300, FULL - 24_000], rtol=1e-7)
 
@@ -96,7 +95,6 @@ def test_a_uav_that_cannot_pay_is_charged_at_a_depot_and_grounded_elsewhere():
 def test_a_grounded_uav_does_nothing():
     state, outcome = play(fleet_layout(2), [2, 0], at=[DEVICE_2, DEVICE_0], grounded=[True, False])
     assert_array_equal(outcome.served, [True, True, False])
-    assert_array_equal(outcome.started, [False, True])
     assert_array_equal(state.uav_energy, [FULL, FULL - 24_000])
     assert_array_equal(state.grounded, [True, False])
 
@@ -152,9 +150,8 @@ def test_pads_serve_the_lowest_numbers_first_and_packs_run_out():
     state, _ = play(fleet_layout(3, depots), [3, 3, 3], at=[ORIGIN, DEVICE_0, ORIGIN], uav_energy=[FULL, 5000.0, 7.0])
     assert_array_equal(state.uav_energy, [FULL, FULL, 7])
     assert_array_equal(state.packs, [0])
-    state, outcome = play(fleet_layout(3, depots), [3, 3, 3], uav_energy=[FULL, FULL, 7.0], packs=[0])
+    state, _ = play(fleet_layout(3, depots), [3, 3, 3], uav_energy=[FULL, FULL, 7.0], packs=[0])
     assert_array_equal(state.uav_energy, [FULL, FULL, 7])
-    assert_array_equal(outcome.started, [True] * 3)
     assert_array_equal(state.packs, [0])
 
 
@@ -196,7 +193,6 @@ def test_the_uavs_end_the_episode_only_where_no_depot_helps(depot, cause, energy
     layout = fleet_layout(2, made.replace(pads=jnp.array([depot.get("pads", 1.0)])))
     state, outcome = play(layout, [2, 2], at=[ORIGIN, DEVICE_0], uav_energy=[9.0, 9.0])
     assert outcome.cause == cause
-    assert_array_equal(outcome.started, [False, False])
     assert_array_equal(state.uav_energy, [energy, 9])
     played = cause == Cause.NONE
     assert_array_equal(state.grounded, [False, played])
