@@ -67,9 +67,7 @@ def scenario_options(*, argument: bool) -> Callable[[Callable], Callable]:
         click.option("--place", help="Evacuation whose devices a random scenario has (see uavmec traffic)."),
         click.option("--uavs", type=int, help="Number of UAVs in a random scenario (default: 1)."),
         click.option(
-            "--depot",
-            type=click.Choice(["swap", "charge"]),
-            help="What the depot at the corner of a random scenario does (default: no depot).",
+            "--depot", metavar="KIND", help="Add a depot to a random scenario, at its corner: swap or charge."
         ),
         click.option("--seed", type=int, default=0, help="Seed of the random scenario and of the task volumes."),
         set_option(help="Change a parameter of Table 1, e.g. --set uav_battery_j=1e6."),

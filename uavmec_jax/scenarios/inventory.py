@@ -22,7 +22,7 @@ from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import MAX_DEVICES, Params
 from uavmec_jax.files.validation import suggest
 from uavmec_jax.scenarios.region import Positions
-from uavmec_jax.scenarios.schema import Device, ScenarioFile, label
+from uavmec_jax.scenarios.schema import DepotTable, Device, ScenarioFile, label
 
 UNLISTED = -1
 """``device_type`` and ``task`` of hardware that the paper's tables do not list."""
@@ -46,7 +46,16 @@ def check_inventory(file: ScenarioFile) -> None:
     _check_names([("uav", number, name) for number, name in enumerate(file.uav_names, 1)])
     if all(device.priority == 0 for device in file.device):
         raise ValueError("priority is 0 for all devices; give at least one of them more")
-    for number, depot in enumerate(file.depot, 1):
+    check_depots(file.depot)
+
+
+def check_depots(tables: Sequence[DepotTable]) -> None:
+    """Check that depots have only the settings of their kind.
+
+    Raises:
+        ValueError: one line that names the depot.
+    """
+    for number, depot in enumerate(tables, 1):
         field, does, other = ("power_w", "swaps", "charge") if depot.kind == "swap" else ("packs", "charges", "swap")
         if (value := getattr(depot, field)) is not None:
             raise ValueError(
@@ -76,7 +85,6 @@ def build_layout(file: ScenarioFile, params: Params, positions: Positions) -> La
     priority = None
     if any(device.priority is not None for device in devices):
         priority = jnp.asarray(_column(devices, "priority", 1.0))
-    depots = _depots(file, positions)
     return Layout(
         position=jnp.asarray(positions.devices, jnp.float32),
         device_type=jnp.asarray([_index(device.type, hardware.DEVICE_TYPES) for device in devices], jnp.int32),
@@ -89,19 +97,19 @@ def build_layout(file: ScenarioFile, params: Params, positions: Positions) -> La
         processing_rate=jnp.asarray(powers[:, 2], jnp.float32),
         priority=priority,
         fleet=_fleet(file, params, positions),
-        depots=depots,
+        depots=depots_of(file.depot, positions.depots),
     )
 
 
-def _depots(file: ScenarioFile, positions: Positions) -> Depots | None:
-    """Return the depots, ``None`` without tables."""
-    if not file.depot:
+def depots_of(tables: Sequence[DepotTable], position: Float[np.ndarray, "D 2"]) -> Depots | None:
+    """Return the depots of the tables at the given positions, m; ``None`` without tables."""
+    if not tables:
         return None
     numbers = {
-        field: _column(file.depot, field, default)
+        field: _column(tables, field, default)
         for field, default in (("pads", np.inf), ("packs", np.inf), ("power_w", DEPOT_POWER_W))
     }
-    return make_depots(positions.depots, [depot.kind for depot in file.depot], **numbers)
+    return make_depots(position, [depot.kind for depot in tables], **numbers)
 
 
 def _fleet(file: ScenarioFile, params: Params, positions: Positions) -> Fleet | None:
