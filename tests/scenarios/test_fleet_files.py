@@ -1,5 +1,6 @@
 """Scenario files with UAVs, depots and priorities: read, written back, and refused where they are wrong."""
 
+import re
 import time
 from dataclasses import replace
 
@@ -21,6 +22,7 @@ from uavmec_jax.files.reading import parse_toml
 from uavmec_jax.scenarios.load import load_scenario
 from uavmec_jax.scenarios.named_scenario import make_named_scenario, name_scenario
 from uavmec_jax.scenarios.scenario_files import load_scenario_file, scenario_text
+from uavmec_jax.scenarios.schema import DepotTable, Device, Uav
 
 FLEET = EXAMPLES / "harbour_fleet.toml"
 
@@ -62,6 +64,20 @@ def test_the_example_is_read_back():
     assert again.file == harbour.file
     assert again.params == harbour.params
     chex.assert_trees_all_equal(again.layout, harbour.layout)
+
+
+def test_the_docs_show_the_format():
+    text = (EXAMPLES.parent / "planning.md").read_text()
+    devices, fleet = (
+        parse_toml(block, "docs", ScenarioError) for block in re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
+    )
+    make_named_scenario(devices, "docs")
+    scenario = make_named_scenario({"device": devices["device"]} | fleet, "docs")
+    given = {table: set(fleet[table][0]) for table in ("uav", "depot")}
+    assert set(Uav.model_fields) - given["uav"] == {"x_m", "y_m", "lon", "lat"}
+    assert set(DepotTable.model_fields) - given["depot"] == {"x_m", "y_m", "power_w"}
+    assert set(Device.model_fields) - set(devices["device"][0]) == {"x_m", "y_m"}
+    assert scenario.layout.n_places == 2
 
 
 def test_without_tables_there_is_the_paper():
