@@ -82,7 +82,7 @@ def main() -> None:
 def measure_environment(uavs: int, devices: int, layouts: int, depot: bool, seconds: float) -> dict[str, Any]:
     """Measure the environment under random actions on all cores."""
     speed = environment_speed(layouts, seconds, devices=devices, uavs=uavs, depot=depot)
-    params, layout, state = make_instance(uavs, devices, depot)
+    _, layout, state = make_instance(uavs, devices, depot)
     size = sum(leaf.nbytes for leaf in jax.tree.leaves((layout, state)))
     return {
         "uavs": uavs,
