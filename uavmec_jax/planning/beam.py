@@ -30,6 +30,7 @@ from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.planning import demand
 from uavmec_jax.planning.demand import SlotCosts
+from uavmec_jax.planning.fleet_demand import counting_bound
 
 WIDTH = 64
 """States kept per slot by default. A beam four times as wide lengthens one lifetime in 400, by one slot."""
@@ -82,28 +83,6 @@ class _Problem(NamedTuple):
     value_fn: ValueFn | None
 
 
-def horizon(params: Params, layouts: Layout) -> int:
-    """Return the number of slots to plan for: a power of two, at least 64, that no lifetime exceeds.
-
-    Args:
-        params: leaves ``[B]``.
-        layouts: leaves ``[B, n]``.
-    """
-    needed = int(jnp.max(longest(params, layouts)))
-    return max(64, 1 << (needed - 1).bit_length())
-
-
-@jax.jit
-@jax.vmap
-def longest(params: Params, layout: Layout) -> Int[Array, ""]:
-    """Return the slots ``[B]`` that the UAV's energy pays for if each is as short as can be; leaves ``[B]``, ``[B, n]``."""
-    least = jnp.full((1, layout.capacity.shape[0]), params.task_volume_range_bytes[0], jnp.float32)
-    shortest = jnp.min(demand.slot_costs(params, layout, least).duration)
-    base, _ = demand.flight_power(params)
-    affordable = params.uav_battery_j / jnp.maximum(base * shortest, 1e-3) + 2
-    return jnp.minimum(affordable, params.max_slots).astype(jnp.int32)
-
-
 def beam_search(
     params: Params,
     layout: Layout,
@@ -117,7 +96,7 @@ def beam_search(
     Args:
         params: scenario parameters.
         layout: the devices.
-        volumes: bytes, the tasks of every slot; ``H`` from :func:`horizon`.
+        volumes: bytes, the tasks of every slot; ``H`` from :func:`uavmec_jax.planning.fleet_demand.horizon`.
         width: states kept per slot; static.
         upper_bound: slots, a known upper bound on the lifetime, from which the search then starts.
         value_fn: scores the states that are not pruned with a proof, e.g. a learned critic; by default, the score is
@@ -148,36 +127,6 @@ def beam_search(
         lambda carry: carry[1] < carry[0], attempt, (bound, jnp.int32(0), no_visits)
     )
     return Tour(lifetime=lifetime, actions=actions, bound=bound)
-
-
-def counting_bound(params: Params, layout: Layout, costs: SlotCosts) -> Int[Array, ""]:
-    """Return an upper bound on the lifetime by counting: the visits needed must fit into the slots.
-
-    A lifetime of k slots means that k - 1 slots were survived and that the UAV's energy sufficed for k.
-    """
-    state = initial_state(params, layout)
-    visit_share = demand.visit_shares(layout, demand.coverage(params, layout))
-    slots = costs.work.shape[0]
-    base, extra = demand.flight_power(params)
-    first_flight = jnp.min(jnp.linalg.norm(layout.position, axis=-1)) / params.uav_speed_m_s
-    paid = jnp.cumsum(base * jnp.min(costs.duration, axis=1)) + extra * first_flight
-
-    def feasible(lifetime: Int[Array, ""]) -> Bool[Array, ""]:
-        need = demand.battery_demand(layout, costs, 0, lifetime - 1)
-        battery_visits, _, infeasible = demand.battery_visits(layout, need, state.battery)
-        age_visits, _ = demand.age_visits(params, layout, state.age, lifetime - 1)
-        started = lifetime - jnp.where(params.count_unfinished_slot, 1, 0)
-        affordable = (started == 0) | (paid[started - 1] <= params.uav_battery_j * (1.0 + 1e-5))
-        return (
-            affordable
-            & ~jnp.any(infeasible)
-            & (jnp.sum(visit_share * jnp.maximum(battery_visits, age_visits)) <= lifetime - 1 + 1e-3)
-            & ~demand.misses_deadline(params, layout, visit_share, state.age, lifetime - 1)
-        )
-
-    lifetimes = jnp.arange(1, slots + 1)
-    longest_feasible = jnp.max(jnp.where(jax.lax.map(feasible, lifetimes), lifetimes, 1))
-    return jnp.minimum(longest_feasible, params.max_slots).astype(jnp.int32)
 
 
 def _nominal_round_length(layout: Layout, visit_share: Float[Array, " n"]) -> Float[Array, ""]:
