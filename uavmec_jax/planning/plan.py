@@ -13,9 +13,9 @@ from uavmec_jax.env.dynamics import Cause
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Trace, tour_policy, trace
-from uavmec_jax.planning.beam import horizon
 from uavmec_jax.planning.changes import WhatIf, every_change, rank_changes
 from uavmec_jax.planning.fleet_deadlines import earliest_deadline
+from uavmec_jax.planning.fleet_demand import horizon
 from uavmec_jax.planning.forecast import Forecast
 from uavmec_jax.planning.heuristics import FLEET_HEURISTICS, HEURISTICS
 from uavmec_jax.planning.parallel import (
