@@ -106,9 +106,11 @@ def _split_location(location: list[Any], model: type[BaseModel], data: Any) -> t
     in_list = len(location) > 1 and isinstance(location[1], int) and bool(_fields_at(model, location[:1]))
     if not in_list or not isinstance(data, dict):
         return "", location
-    table = data[location[0]][location[1]]
+    table, number = data[location[0]][location[1]], f"{location[0]} {location[1] + 1}"
+    if "name" not in _fields_at(model, location[:1]):
+        return f"{number}: ", location[2:]
     name = table.get("name", "no name") if isinstance(table, dict) else table
-    return f"{location[0]} {location[1] + 1} ({name}): ", location[2:]
+    return f"{number} ({name}): ", location[2:]
 
 
 def _fields_at(model: Any, location: Sequence[Any]) -> dict[str, Any]:

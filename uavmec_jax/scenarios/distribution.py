@@ -11,7 +11,7 @@ from pydantic import Field
 from uavmec_jax.env import hardware
 from uavmec_jax.env.generator import ScenarioDistribution
 from uavmec_jax.env.layout import Layout
-from uavmec_jax.env.params import Params
+from uavmec_jax.env.params import ENDS, Params
 from uavmec_jax.env.rewards import Reward
 from uavmec_jax.files.validation import from_array, model_from_dataclasses
 from uavmec_jax.traffic.evacuation import load_evacuation
@@ -92,6 +92,9 @@ def out_of_distribution(
         for name, (values, bounds) in _drawn_quantities(scenarios, trained, params, layout).items()
         if np.min(values) < bounds[0] * (1 - 1e-6) or np.max(values) > bounds[1] * (1 + 1e-6)
     ]
+    end = trained.get("end", ENDS[0])
+    if params.end != end:
+        outside.append(f"end: {params.end}; it was trained on {end}")
     constant = {name: getattr(params, name) for name in trained if name not in _NOT_CONSTANT}
     return outside + [
         f"{name}: {value}; it was trained on {trained[name]}"
@@ -100,8 +103,11 @@ def out_of_distribution(
     ]
 
 
-_NOT_CONSTANT = ("n_devices", "region_m", "device_battery_range_j", "uav_battery_j", "uav_speed_m_s", "max_slots")
-"""Parameters that a distribution draws, that the layout replaces, or that do not matter to a policy."""
+_NOT_CONSTANT = (
+    *("n_devices", "region_m", "device_battery_range_j", "uav_battery_j", "uav_speed_m_s", "max_slots"),
+    "end",
+)
+"""Parameters that a distribution draws, that the layout replaces, that do not matter to a policy, or that are no number."""
 
 
 def _drawn_quantities(
