@@ -25,6 +25,7 @@ from uavmec_jax.studies.compare import Side, mostly_censored, overall, pair
 from uavmec_jax.studies.evaluation_result import MISSING, EvaluationResult, PlannerResult
 from uavmec_jax.studies.measures import with_measures
 from uavmec_jax.studies.parts import split_study
+from uavmec_jax.studies.places import load_evacuations
 from uavmec_jax.studies.population import (
     cell_axes,
     clairvoyant_seeds,
@@ -138,22 +139,22 @@ BAD = [
     ({"axes.depots": [2]}, "bad.toml: axes.depots has 2; give whole numbers from 0 to 1, the number of depot tables"),
     ({"depot": [], "axes.depots": [1]}, "bad.toml: axes.depots has 1; add a table [[depot]] for each"),
     ({"depots": 2}, "bad.toml: depots is 2; give whole numbers from 0 to 1, the number of depot tables"),
-    ({"depot": [{"x_m": 1.0}]}, "bad.toml: depot 1: y_m is missing"),
+    ({"depot": [{"x_m": 1.0}]}, "bad.toml: depot 1 (no name): y_m is missing"),
     (
         {"depot": [{"x_m": 1.0, "y_m": 1.0, "pads": 0.0}]},
-        "bad.toml: depot 1: pads is 0.0; it should be greater than or",
+        "bad.toml: depot 1 (no name): pads is 0.0; it should be greater than or",
     ),
     (
         {"depot": [{"x_m": 1.0, "y_m": 1.0, "kind": "fuel"}]},
-        "bad.toml: depot 1: kind is 'fuel'; it should be 'swap' or",
+        "bad.toml: depot 1 (no name): kind is 'fuel'; it should be 'swap' or",
     ),
     (
         {"depot": [{"x_m": 1.0, "y_m": 1.0, "pad": 1.0}]},
-        "bad.toml: depot 1: pad is not a setting; did you mean 'pads'?",
+        "bad.toml: depot 1 (no name): pad is not a setting; did you mean 'pads'?",
     ),
     (
         {"depot": [{"x_m": 1.0, "y_m": 1.0}, {"x_m": 900.0, "y_m": 0.0}]},
-        "bad.toml: depot 2 is at [900.0, 0.0], outside params.region_m, [800.0, 800.0]; give x_m and y_m inside it",
+        "bad.toml: depot 2 (no name): is at [900.0, 0.0], outside params.region_m, 800 x 800 m; give x_m and y_m inside",
     ),
     (
         {"algorithm": "dqn"},
@@ -199,6 +200,12 @@ def test_a_horizon_and_the_term_of_service_are_settings():
     assert_array_equal(scenario.params.horizon_s[:2], [6e3, 12e3])
     assert_array_equal(scenario.reward.service, np.full(16, 2.0))
     assert parse_study(study_toml(study), "again").params == study.params
+
+
+def test_a_depot_outside_a_place_is_refused():
+    changes = {"place": "albany", "params.n_devices": 12, "depot": [{"x_m": 1e5, "y_m": 0.0}]}
+    with pytest.raises(StudyError, match=r"x: depot 1 \(no name\): is at \[100000.0, 0.0\], outside place 'albany', "):
+        load_evacuations(parse_study(TOML, "x", changes))
 
 
 # Which agents are evaluated by beam and bound

@@ -89,7 +89,7 @@ def evaluate(
         trained.save(save)
     if as_json:
         about = {"algorithm": trained.algorithm, "trained_on": dict(trained.trained_on)} if trained else {}
-        head = {"command": command_line(), "scenario": str(scenario.file or scenario.axes)}
+        head = {"command": command_line(), "scenario": str(scenario.file or scenario.axes | scenario.fleet)}
         print_json(head | about | {"policies": rows})
         return
     console = Console()
@@ -106,8 +106,10 @@ def _training_lines(trained: Any, named: Any, scenario: ScenarioChoice) -> list[
     lines = [f"Trained by {trained.algorithm.upper()} on {axes}."]
     lines += [f"Out of distribution: {line}." for line in trained.out_of_distribution(named.params, named.layout)]
     here = scenario.axes
-    elsewhere = scenario.file is not None or any(
-        trained.trained_on.get(name) != here.get(name) for name in (*here, "place")
+    elsewhere = (
+        scenario.file is not None
+        or bool(scenario.fleet)
+        or any(trained.trained_on.get(name) != here.get(name) for name in (*here, "place"))
     )
     if trained.n_devices is not None and elsewhere:
         lines.append(

@@ -213,6 +213,11 @@ class Trace:
 
 def trace(policy: Policy, params: Params, layout: Layout, key: PRNGKeyArray, slots: int) -> Trace:
     """Record the first ``slots`` slots of the episode that :func:`rollout` plays with the same key."""
+    return trace_from(policy, params, layout, initial_state(params, layout), key, slots)
+
+
+def trace_from(policy: Policy, params: Params, layout: Layout, state: State, key: PRNGKeyArray, slots: int) -> Trace:
+    """Record the next ``slots`` slots of the episode that :func:`rollout_from` plays with the same key."""
     play_slot = _make_play_slot(policy, params, layout, key)
 
     def play_if(carry: tuple[State, Outcome], _: None) -> tuple[tuple[State, Outcome], Trace]:
@@ -221,7 +226,7 @@ def trace(policy: Policy, params: Params, layout: Layout, key: PRNGKeyArray, slo
         state, outcome = jax.tree.map(lambda new, old: jnp.where(played, new, old), tuple(new), carry)
         return (state, outcome), Trace(played=played, action=action, state=state, outcome=outcome)
 
-    start = (initial_state(params, layout), _initial_outcome(layout.n_devices))
+    start = (complete_state(layout, state), _initial_outcome(layout.n_devices))
     return jax.lax.scan(play_if, start, None, length=slots)[1]
 
 

@@ -4,7 +4,7 @@ import dataclasses
 import difflib
 import math
 from collections.abc import Iterable, Sequence
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import pydantic
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, create_model
@@ -106,11 +106,9 @@ def _split_location(location: list[Any], model: type[BaseModel], data: Any) -> t
     in_list = len(location) > 1 and isinstance(location[1], int) and bool(_fields_at(model, location[:1]))
     if not in_list or not isinstance(data, dict):
         return "", location
-    table, number = data[location[0]][location[1]], f"{location[0]} {location[1] + 1}"
-    if "name" not in _fields_at(model, location[:1]):
-        return f"{number}: ", location[2:]
+    table = data[location[0]][location[1]]
     name = table.get("name", "no name") if isinstance(table, dict) else table
-    return f"{number} ({name}): ", location[2:]
+    return f"{location[0]} {location[1] + 1} ({name}): ", location[2:]
 
 
 def _fields_at(model: Any, location: Sequence[Any]) -> dict[str, Any]:
@@ -118,9 +116,12 @@ def _fields_at(model: Any, location: Sequence[Any]) -> dict[str, Any]:
     for part in location:
         if isinstance(part, int):  # all tables of a list have the same model
             continue
+        if get_origin(model) is dict:  # and so have all tables by name
+            model = get_args(model)[1]
+            continue
         fields = getattr(model, "model_fields", None)
         if fields is not None:
             model = fields[part].annotation if part in fields else None
-        arguments = get_args(model)  # of X | None or tuple[X, ...]
+        arguments = () if get_origin(model) is dict else get_args(model)  # of X | None or tuple[X, ...]
         model = next((argument for argument in arguments if hasattr(argument, "model_fields")), model)
     return dict(getattr(model, "model_fields", {}))

@@ -29,7 +29,7 @@ from uavmec_jax.env.dynamics import slots_to_expiry
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.planning import demand
-from uavmec_jax.planning.beam import counting_bound
+from uavmec_jax.planning.beam_score import counting_bound
 from uavmec_jax.planning.flight import Rounds
 
 _SLACK = 1e-5

@@ -180,16 +180,17 @@ def misses_deadline(
     visit_share: Float[Array, " n"],
     age: Int[Array, "*B n"],
     slots: Num[ArrayLike, ""],
+    servers: int | Int[Array, "*B 1"] = 1,
 ) -> Bool[Array, "*B"]:
     """Return whether the data that expire within ``slots`` more slots can no longer all be refreshed in time.
 
     This is the demand test of earliest-deadline scheduling: for every deadline, the visits due by then, counted in
-    :func:`visit_shares`, must fit into the slots until then.
+    :func:`visit_shares`, must fit into the slots until then, in each of which ``servers`` UAVs make one visit.
     """
     deadline = slots_to_expiry(params) - age
     counts = ~layout.has_comms & (deadline <= slots)
     load = load_by_deadline(jnp.where(counts, deadline, jnp.iinfo(jnp.int32).max), visit_share)
-    return jnp.any(counts & (load > deadline + _ROUNDING * 10), axis=-1)
+    return jnp.any(counts & (load > servers * deadline + _ROUNDING * 10), axis=-1)
 
 
 def load_by_deadline(deadline: Num[Array, "*B n"], visit_share: Float[Array, " n"]) -> Float[Array, "*B n"]:

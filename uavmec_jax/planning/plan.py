@@ -15,9 +15,16 @@ from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Trace, tour_policy, trace
 from uavmec_jax.planning.beam import horizon
 from uavmec_jax.planning.changes import WhatIf, every_change, rank_changes
+from uavmec_jax.planning.fleet_deadlines import earliest_deadline
 from uavmec_jax.planning.forecast import Forecast
-from uavmec_jax.planning.heuristics import HEURISTICS
-from uavmec_jax.planning.parallel import beam_episodes, bound_scenarios, heuristic_episodes, rollout_planner_episodes
+from uavmec_jax.planning.heuristics import FLEET_HEURISTICS, HEURISTICS
+from uavmec_jax.planning.parallel import (
+    beam_episodes,
+    bound_scenarios,
+    heuristic_episodes,
+    policy_episodes,
+    rollout_planner_episodes,
+)
 from uavmec_jax.planning.rollout_planner import SAMPLES
 
 WIDTH = 256
@@ -32,10 +39,11 @@ class Plan:
         params: scenario parameters.
         layout: the devices.
         lifetimes: ``[D]`` slots by policy: the heuristics, ``rollout``, and ``beam``, which is clairvoyant.
-        bound: ``[D]`` slots, certified upper bounds on the lifetime of any policy.
+        bound: ``[D]`` slots, certified upper bounds on the lifetime of any policy; at most ``max_slots``.
         forecast: the forecast under the rollout planner.
         tours: slot by slot, those of ``rollout`` and ``beam`` on the first draw.
-        what_if: every repair and removal of one device, the largest gain first.
+        what_if: every repair and removal of one device, the largest gain first: under the rollout planner, for a fleet
+            under the earliest-deadline rule.
     """
 
     params: Params
@@ -60,20 +68,24 @@ def make_plan(
         samples: futures that the rollout planner simulates per candidate.
     """
     count = draws.shape[0]
-    # One call of the rollout planner simulates the scenario as it is and with every change.
-    changed = every_change(layout)
-    layouts = jax.tree.map(lambda *leaves: jnp.repeat(jnp.stack(leaves), count, axis=0), layout, *changed)
-    per_layout, per_draw = _repeat(params, len(layouts.capacity)), _repeat(params, count)
-    unchanged = jax.tree.map(lambda leaf: leaf[:count], layouts)
+    if layout.n_uavs == 1:
+        # One call of the rollout planner simulates the scenario as it is and with every change.
+        layouts, per_layout, all_draws = _with_changes(params, layout, draws)
+    else:
+        layouts, per_layout, all_draws = _repeat(layout, count), _repeat(params, count), draws
+    per_draw, unchanged = _repeat(params, count), jax.tree.map(lambda leaf: leaf[:count], layouts)
     slots = horizon(per_layout, layouts)
-    all_draws = jnp.tile(draws, len(changed) + 1)
     tours, episodes = rollout_planner_episodes(per_layout, layouts, all_draws, slots=slots, samples=samples)
     rollout = jax.tree.map(lambda leaf: np.asarray(leaf[:count]), episodes)
     beam_tours, beam = beam_episodes(per_draw, unchanged, draws, slots=slots, width=width)
-    simple = heuristic_episodes(tuple(HEURISTICS), *_repeat((params, layout), 1), draws[None])
-    lifetimes = {name: np.asarray(simple.length[k, 0]) for k, name in enumerate(HEURISTICS)}
+    names = tuple(HEURISTICS if layout.n_uavs == 1 else FLEET_HEURISTICS)
+    simple = heuristic_episodes(names, *_repeat((params, layout), 1), draws[None])
+    lifetimes = {name: np.asarray(simple.length[k, 0]) for k, name in enumerate(names)}
     lifetimes |= {"rollout": rollout.length, "beam": np.asarray(beam.length)}
     longest = np.max(list(lifetimes.values()), axis=0)
+    if layout.n_uavs > 1:
+        layouts, per_layout, all_draws = _with_changes(params, layout, draws)
+        episodes = policy_episodes(earliest_deadline, per_layout, layouts, all_draws[:, None])
     by_change = np.asarray(episodes.length).reshape(-1, count)
     return Plan(
         params=params,
@@ -87,6 +99,13 @@ def make_plan(
         },
         what_if=rank_changes(layout, by_change[1:], by_change[0]),
     )
+
+
+def _with_changes(params: Params, layout: Layout, draws: Key[Array, " D"]) -> tuple[Layout, Params, Key[Array, " LD"]]:
+    """Return the layout as it is and with every change, each with every draw: leaves ``[L * D, ...]``."""
+    layouts = [layout, *every_change(layout)]
+    repeated = jax.tree.map(lambda *leaves: jnp.repeat(jnp.stack(leaves), len(draws), axis=0), *layouts)
+    return repeated, _repeat(params, len(layouts) * len(draws)), jnp.tile(draws, len(layouts))
 
 
 def _repeat(tree: Any, count: int) -> Any:

@@ -51,7 +51,7 @@ def _learned_episodes(algorithm: Algorithm, agents: Agent, keys: Key[Array, "A E
 
 
 def evaluate_heuristics(agents: Agent, keys: Key[Array, "A E"], names: Iterable[str]) -> dict[str, EvaluationResult]:
-    """Evaluate heuristics, by their names in :data:`HEURISTICS`, on every agent's scenario.
+    """Evaluate heuristics, by their names in :data:`FLEET_HEURISTICS`, on every agent's scenario.
 
     Args:
         agents: leaves ``[A, ...]``.

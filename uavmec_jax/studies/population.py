@@ -20,8 +20,8 @@ from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params, leaf_dtype
 from uavmec_jax.env.rewards import Reward, make_reward, needs_guard
 from uavmec_jax.env.scenario import Scenario
-from uavmec_jax.scenarios.depots import depots_of
 from uavmec_jax.scenarios.distribution import make_distribution
+from uavmec_jax.scenarios.inventory import depots_of
 from uavmec_jax.scenarios.seeds import Stream, identity_keys, layout_for_seed
 from uavmec_jax.studies.axes import TRAFFIC_WEIGHTS
 from uavmec_jax.studies.parts import split_study
@@ -166,7 +166,8 @@ def _stack_rewards(rewards: list[Reward]) -> Reward:
 
 def _add_fleets(layouts: Layout, params: Params, study: Study) -> Layout:
     """Give agents' layouts, leaves ``[A, ...]``, the UAVs and the depots of a part; one UAV without depots is no fleet."""
-    depots = depots_of(study.depots_there)
+    position = np.array([(depot.x_m, depot.y_m) for depot in study.depots_there]).reshape(-1, 2)
+    depots = depots_of(study.depots_there, position)
     if study.uavs == 1 and depots is None:
         return layouts
     fleets = jax.vmap(lambda params: make_fleet(params, study.uavs, depots))(params)

@@ -4,6 +4,7 @@ The numbers of Table 1 and the hyperparameters are declared once (:class:`Params
 made from those declarations.
 """
 
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal, get_args
 
 import pydantic
@@ -14,10 +15,11 @@ from uavmec_jax.env.fleet import MAX_UAVS
 from uavmec_jax.env.rewards import DEFAULT_REWARD, LOG_GUARDS
 from uavmec_jax.files.validation import StrictModel, from_array, model_from_dataclasses
 from uavmec_jax.planning.beam import WIDTH as BEAM_WIDTH
-from uavmec_jax.planning.heuristics import HEURISTICS
+from uavmec_jax.planning.heuristics import FLEET_HEURISTICS, HEURISTICS
 from uavmec_jax.planning.rollout_planner import SAMPLES as ROLLOUT_SAMPLES
-from uavmec_jax.scenarios.depots import DepotSettings, check_depots
 from uavmec_jax.scenarios.distribution import ScenarioSettings, check_scenarios
+from uavmec_jax.scenarios.inventory import check_depots
+from uavmec_jax.scenarios.schema import DepotSettings, label
 from uavmec_jax.scenarios.settings import ParamsSettings, check_ranges
 from uavmec_jax.studies.axes import TRAFFIC_WEIGHTS, check_axes, check_reward, expected_depots
 
@@ -36,7 +38,7 @@ A2CSettings: Any = _algorithm_settings("a2c")
 
 AlgorithmName: Any = Literal[(*ALGORITHMS, "none")]
 Guard: Any = Literal[LOG_GUARDS]
-Heuristic: Any = Literal[tuple(HEURISTICS)]
+Heuristic: Any = Literal[tuple(FLEET_HEURISTICS)]
 
 Planner = Literal["rollout", "beam", "bound"]
 PLANNERS: tuple[Planner, ...] = get_args(Planner)
@@ -67,6 +69,13 @@ class Evaluation(StrictModel):
     beam_width: Annotated[int, Field(ge=1, le=100_000)] = BEAM_WIDTH
 
 
+class StudyDepot(DepotSettings):
+    """One depot of a study."""
+
+    x_m: float
+    y_m: float
+
+
 class Study(StrictModel):
     """A study; its population is the product of its axes."""
 
@@ -94,7 +103,7 @@ class Study(StrictModel):
     """Distribution from which every episode draws a scenario; it replaces the axes ``powered`` and ``connected``."""
     uavs: Annotated[int, Field(ge=1, le=MAX_UAVS)] = 1
     """Number of UAVs, all like that of ``params``."""
-    depot: Annotated[tuple[DepotSettings, ...], from_array] = ()
+    depot: Annotated[tuple[StudyDepot, ...], from_array] = ()
     """Where UAVs swap or charge their batteries."""
     depots: Annotated[int, Field(ge=0)] | None = None
     """How many of the tables ``depot`` are there, the first ones; by default all of them."""
@@ -116,7 +125,7 @@ class Study(StrictModel):
         return tuple(name for name in ALGORITHMS if isinstance(names, list) and name in names)
 
     @property
-    def depots_there(self) -> tuple[DepotSettings, ...]:
+    def depots_there(self) -> tuple[StudyDepot, ...]:
         """The depots of a study without the axis ``depots``."""
         return self.depot[: self.depots]
 
@@ -159,6 +168,22 @@ def _check_traffic(study: Study) -> None:
             raise ValueError(f"{name} is given, but no place; give place, e.g. place = 'albany'")
 
 
+def check_inside(depots: Sequence[StudyDepot], region_m: tuple[float, float], region: str) -> None:
+    """Check that every depot is inside a region.
+
+    Raises:
+        ValueError: one line that names the depot and the ``region``.
+    """
+    for number, depot in enumerate(depots, 1):
+        position = (depot.x_m, depot.y_m)
+        if not all(0 <= at <= side for at, side in zip(position, region_m, strict=True)):
+            sides = " x ".join(f"{side:.0f}" for side in region_m)
+            raise ValueError(
+                f"{label('depot', number, depot.name)}: is at {list(position)}, outside {region}, {sides} m; "
+                "give x_m and y_m inside it"
+            )
+
+
 def _check_fleets(study: Study) -> None:
     """Check the depots, and that nothing but evaluation is asked of fleets."""
     if study.depots is not None and study.depots > len(study.depot):
@@ -169,8 +194,9 @@ def _check_fleets(study: Study) -> None:
         raise ValueError(
             "evaluation.clairvoyant_seeds is given, and scenarios too, whose seeds share them; leave it out"
         )
+    check_depots(study.depot)
     if not (study.place or "place" in study.axes):
-        check_depots(study.depot, study.params.region_m)
+        check_inside(study.depot, study.params.region_m, "params.region_m")
     there = study.axes.get("depots", [len(study.depots_there)])
     for name, values, least in (("uavs", study.axes.get("uavs", [study.uavs]), 1), ("depots", there, 0)):
         if max(values) == least:
