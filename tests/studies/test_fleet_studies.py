@@ -367,12 +367,12 @@ def test_service_is_a_share_of_the_horizon():
 def test_means_leave_out_cells_that_are_mostly_censored(results):
     lines = summary(results)
     assert lines[0] == "2 UAVs, 0 depots: Mean over 2 cells, slots: earliest-deadline 14.25, oldest-first 12.25."
-    assert lines[1].startswith("2 UAVs, 0 depots: 1 of 3 cells are in none of these means")
-    assert lines[1].endswith("reach max_slots. 4/8: earliest-deadline (100% censored).")
+    assert lines[1].startswith("2 UAVs, 0 depots: Left out of these means: 1 of 3 cells, where half or more of the")
+    assert lines[1].endswith("censored (reach max_slots): 4/8 (earliest-deadline 100%).")
     assert "On the planners' draws (1 per layout): earliest-deadline 10.00, rollout planner 11.00, upper" in lines[2]
     assert "earliest-deadline to rollout planner 10.0 (most 10.0)" in lines[2]
-    assert "2 of 3 cells are in none" in lines[3]
-    assert "6/8: upper bound (100% censored); 4/8: earliest-deadline (100% censored), rollout" in lines[3]
+    assert "2 of 3 cells, where" in lines[3]
+    assert "6/8 (upper bound 100%); 4/8 (earliest-deadline 100%, rollout planner 100%, upper bound" in lines[3]
     assert lines[4].startswith("3 UAVs, 0 depots: Mean over 2 cells")
     assert "(1 per layout, 6 of 12 layouts)" in lines[6]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool
 
-from uavmec_jax.reporting.formatting import cell_name, censored, column_name
+from uavmec_jax.reporting.formatting import cell_name, column_name
 from uavmec_jax.reporting.tables import by_fleet, display_name, gap_percent, step_name
 from uavmec_jax.studies.measures import MOST_CENSORED, mostly_censored
 from uavmec_jax.studies.population import cell_axes
@@ -66,11 +66,11 @@ def _left_out_lines(
     names = []
     for _, cell in cells[left_out].iterrows():
         mostly = [policy for policy in policies if cell[f"{policy}_censored"] >= MOST_CENSORED]
-        shares = ", ".join(f"{display_name(policy)}{censored(cell, policy)}" for policy in mostly)
-        names.append(f"{cell_name(cell, cell_axes(results.study))}: {shares}")
+        shares = ", ".join(f"{display_name(policy)} {cell[f'{policy}_censored']:.0%}" for policy in mostly)
+        names.append(f"{cell_name(cell, cell_axes(results.study))} ({shares})")
     return [
-        f"{len(names)} of {len(cells)} cells are in none of these means, because half or more of the episodes of a policy "
-        f"are censored, that is, they reach max_slots. {'; '.join(names)}."
+        f"Left out of these means: {len(names)} of {len(cells)} cells, where half or more of the episodes of a policy are "
+        f"censored (reach max_slots): {'; '.join(names)}."
     ]
 
 

@@ -62,7 +62,7 @@ def _grid_tables(results: Results) -> dict[str, Table]:
     """The tables of a study like Table 5."""
     cells = results.cells()
     trained = [name for name in ("best", "last") if name in results.policies]
-    compared = ["paper"] * _is_papers_fleet(results) + ["oldest-first"] * ("oldest_first" in results.policies)
+    compared = ["paper"] * _is_papers_fleet(results) + [column_name(name) for name in _baselines(results)]
     below = f"; below: {' / '.join(compared)}" if compared else ""
     titles: dict[str, str] = {name: f"Lifetime in slots, `{name}` weights ± 95 %{below}" for name in trained}
     if not trained and results.shown in results.policies:
@@ -76,7 +76,7 @@ def _grid_tables(results: Results) -> dict[str, Table]:
         service = f"Share of the horizon in which devices are in service, {display_name(results.shown)}"
         shown[service] = _grid(cells, lambda cell: Text(f"{cell[f'{results.shown}_service']:.1%}"))
     first = f"First to fail ({display_name(results.shown)}): device, share of held-out episodes, all seeds"
-    return shown | {first: failure_table(cells, results.shown)}
+    return shown | {first: failure_table(results, cells)}
 
 
 def display_name(policy: str) -> str:
@@ -128,9 +128,13 @@ def gap_percent(results: Results, cell: Any) -> dict[str, float]:
 
 
 def grid_table(results: Results, cells: pd.DataFrame, policy: str) -> Table:
-    """Return a grid of lifetimes in slots: ours ± half the 95 % interval; below, the paper's / oldest-first's."""
-    baseline = "oldest_first" if "oldest_first" in results.policies else None
-    return _grid(cells, lambda cell: _lifetime(cell, policy, baseline, _is_papers_fleet(results)))
+    """Return a grid of lifetimes in slots: ours ± half the 95 % interval; below, the paper's / those of baselines."""
+    return _grid(cells, lambda cell: _lifetime(cell, policy, _baselines(results), _is_papers_fleet(results)))
+
+
+def _baselines(results: Results) -> list[str]:
+    """Return the policies that lifetimes are compared with in a grid."""
+    return [name for name in ("oldest_first", "split_deadline") if name in results.policies]
 
 
 def _is_papers_fleet(results: Results) -> bool:
@@ -138,12 +142,12 @@ def _is_papers_fleet(results: Results) -> bool:
     return results.study.uavs == 1 and not results.study.depots_there
 
 
-def _lifetime(cell: Any, policy: str, baseline: str | None, with_paper: bool) -> Text:
+def _lifetime(cell: Any, policy: str, baselines: list[str], with_paper: bool) -> Text:
     paper = TABLE5.get((cell["powered"], cell["connected"])) if with_paper else None
     text = Text(f"{cell[policy]:.1f}", style=_style(cell[policy], paper))
     text.append(half_interval(cell[f"{policy}_low"], cell[f"{policy}_high"]) + censored(cell, policy), style="dim")
     compared = [f"{paper:g}" if paper is not None else "-"] * with_paper
-    compared += [f"{cell[baseline]:.1f}{censored(cell, baseline)}"] if baseline else []
+    compared += [f"{cell[baseline]:.1f}{censored(cell, baseline)}" for baseline in baselines]
     return text.append(f"\n{' / '.join(compared)}" if compared else "", style="not bold default")
 
 
@@ -164,15 +168,23 @@ def paired_table(cells: pd.DataFrame) -> Table:
     return _grid(cells, lambda cell: difference(cell, "best").append("\n").append(difference(cell, "last")))
 
 
-def failure_table(cells: pd.DataFrame, policy: str = "best") -> Table:
-    """Return a grid of the device that fails first most often under a policy, and its share of the episodes."""
+def failure_table(results: Results, cells: pd.DataFrame) -> Table:
+    """Return a grid of the device that fails first most often under the shown policy, and its share of the episodes."""
+    policy = results.shown
 
     def first(cell: Any) -> Text:
         device = cell[f"{policy}_first_device"]
-        text = Text(first_to_fail(device), style="bold" if device else "dim")
+        text = Text(_first_to_fail(results, cell), style="bold" if device else "dim")
         return text.append(f" {cell[f'{policy}_first_share']:.0%}" * bool(device > 0), style="not bold dim")
 
     return _grid(cells, first)
+
+
+def _first_to_fail(results: Results, cell: Any) -> str:
+    """Format what fails first under the shown policy; ``none`` where nothing does before the time is over."""
+    device = cell[f"{results.shown}_first_device"]
+    in_time = results.study.params.end == "horizon" or cell.get(f"{results.shown}_censored", 0.0) == 1
+    return "none" if device == 0 and in_time else first_to_fail(device)
 
 
 def _grid(cells: pd.DataFrame, content: Callable[[Any], Text]) -> Table:
@@ -214,6 +226,6 @@ def list_table(results: Results, cells: pd.DataFrame) -> Table:
             lifetimes.append(f"{slots(cell[policy])}{interval}{censored(cell, policy)}")
         service = [f"{cell[f'{policy}_service']:.1%}" for policy in served]
         gaps = [percent(gap) for gap in gap_percent(results, cell).values()]
-        failing = [] if drawn else [first_to_fail(cell[f"{results.shown}_first_device"])]
+        failing = [] if drawn else [_first_to_fail(results, cell)]
         table.add_row(*axis_values(cell, (*axes, "seeds")), *lifetimes, *service, *gaps, *failing)
     return table
