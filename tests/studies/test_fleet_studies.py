@@ -1,6 +1,8 @@
 """Studies with fleets: parts of one shape, the same draws for all fleets, censored episodes and planners left out."""
 
 import io
+import re
+from pathlib import Path
 
 import chex
 import jax
@@ -18,6 +20,8 @@ from uavmec_jax.reporting import canvas, figures
 from uavmec_jax.reporting.compare import comparison
 from uavmec_jax.reporting.summary import summary
 from uavmec_jax.reporting.tables import gap_percent, tables
+from uavmec_jax.runs.results_folder import load_results
+from uavmec_jax.runs.run import resume_run, run_study
 from uavmec_jax.runs.run_plan import plan_run
 from uavmec_jax.runs.simulate import simulate
 from uavmec_jax.studies import planner_evaluation
@@ -131,6 +135,13 @@ def test_round_trip(study):
     assert parse_study(study_toml(study), "again") == study.model_copy(update={"name": "fleets"})
 
 
+def test_the_docs_show_studies():
+    text = (Path(__file__).parents[2] / "docs" / "studies.md").read_text(encoding="utf-8")
+    studies = [parse_study(block, "docs") for block in re.findall(r"```toml\n(.*?)```", text, re.DOTALL)]
+    assert [study.name for study in studies] == ["my-study", "my-fleets"]
+    assert n_agents(studies[1]) == 2 * 2 * 3 * 3 * 2 * 20
+
+
 BAD = [
     ({"uavs": 0}, "bad.toml: uavs is 0; it should be greater than or equal to 1"),
     ({"uavs": 101}, "bad.toml: uavs is 101; it should be less than or equal to 100"),
@@ -170,6 +181,10 @@ BAD = [
     ),
     ({"evaluation.clairvoyant_seeds": [-1]}, "bad.toml: evaluation.clairvoyant_seeds.0 is -1; it should be greater"),
     ({"reward": {"X": 1.0}}, "bad.toml: reward has the term 'X', which is not one; known: A, U, M, O, log A"),
+    (
+        {"params.end": "horizon", "evaluation.planners": ["rollout", "bound"]},
+        "bad.toml: evaluation.planners has 'bound', which is about the first failure, and params.end is 'horizon'; give",
+    ),
     ({"axes.end": ["horizon"]}, "bad.toml: axes.end is not an axis"),
 ]
 
@@ -347,7 +362,8 @@ def test_without_a_censored_episode_there_is_no_column(results):
 
 
 def test_service_is_a_share_of_the_horizon():
-    study = parse_study(CELLS, "x", {"params.end": "horizon", "params.horizon_s": 1000.0})
+    changes = {"params.end": "horizon", "params.horizon_s": 1000.0, "evaluation.planners": ["rollout"]}
+    study = parse_study(CELLS, "x", changes)
     agents = pd.DataFrame({"seed": [0, 1]})
     cause = np.full((2, 3), Cause.HORIZON, np.int8)
     evaluation = {
@@ -451,3 +467,62 @@ def test_comparisons_leave_out_cells_that_are_mostly_censored(results):
     assert np.isnan(overall(only, cells)["difference"]).all()
     plain, _ = pair(*(Side(results, "earliest-deadline", {"uavs": uavs, "powered": 8}) for uavs in (2, 3)))
     assert not any(name.startswith("censored") for name in plain)
+
+
+# Whole runs
+
+GRID = TOML.replace("uav_battery_j = [8e5, 1.6e6]\n", "")
+
+
+def test_a_run_of_heuristics(tmp_path):
+    """Two cells of each fleet, cut into several shards, and stopped after the first."""
+    study = parse_study(GRID, "fleets", {"evaluation.planners": [], "evaluation.baselines": ["oldest-first"]})
+
+    def stop(progress):
+        raise KeyboardInterrupt
+
+    assert not run_study(study, tmp_path / "run", shard_size=2, on_progress=stop).run["complete"]
+    results = resume_run(tmp_path / "run")
+    agents = results.agents
+    assert results.run["complete"]
+    assert agents.columns[:5].tolist() == ["seed", "powered", "connected", "uavs", "depots"]
+    assert agents[["seed", "powered", "uavs", "depots"]].to_numpy().tolist() == [
+        [agent_id[axis] for axis in ("seed", "powered", "uavs", "depots")] for agent_id in make_agent_ids(study)
+    ]
+    assert agents["oldest_first_lifetime"].between(1, 12).all()
+    always = agents["oldest_first_censored"] == 1
+    assert always.any()
+    assert (agents["oldest_first_cause"][always] == "none").all()
+    assert results.run["partitions"].keys() == {part.name for part in split_study(study)}
+    pd.testing.assert_frame_equal(load_results(tmp_path / "run").agents, agents, check_dtype=False)
+    assert tables(results)
+    assert summary(results)
+
+
+@pytest.mark.slow
+def test_a_run_with_a_planner_until_a_horizon(tmp_path):
+    changes = {"params.end": "horizon", "params.horizon_s": 4000.0, "axes.uavs": [2], "axes.depots": [1]}
+    study = parse_study(GRID, "fleets", changes)
+    results = run_study(study, tmp_path / "run")
+    agents = results.agents
+    for policy in ("oldest_first", "earliest_deadline", "rollout"):
+        assert agents[f"{policy}_service"].between(0, 1.2).all()
+        assert set(agents[f"{policy}_cause"]) <= {"horizon", "none", "share"}
+    assert agents["rollout_service"].mean() >= agents["oldest_first_service"].mean() - 0.05
+    assert any("in service" in title for title in tables(results))
+    assert summary(load_results(tmp_path / "run"))
+
+
+@pytest.mark.slow
+def test_a_run_with_planners(tmp_path):
+    changes = {"axes.powered": [2, 0], "axes.connected": [1], "axes.depots": [1], "params.max_slots": 64}
+    planners = {"evaluation.planners": ["rollout", "beam"], "evaluation.clairvoyant_seeds": [2, 1]}
+    study = parse_study(GRID, "fleets", changes | planners | {"evaluation.beam_width": 4})
+    results = run_study(study, tmp_path / "run")
+    agents = results.agents
+    assert agents["rollout_planned"].notna().all()
+    assert (agents["beam_planned"].isna() == ((agents["uavs"] == 2) & (agents["seed"] == 1))).all()
+    both = agents.dropna(subset=["beam_planned"])
+    assert both["beam_planned"].mean() >= both["oldest_first_planned"].mean()
+    pd.testing.assert_frame_equal(load_results(tmp_path / "run").agents, agents, check_dtype=False)
+    assert "of 4 layouts" in " ".join(summary(results))

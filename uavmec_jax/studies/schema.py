@@ -137,6 +137,7 @@ class Study(StrictModel):
         check_ranges(self.params, "params.")
         _check_drawn(self)
         _check_fleets(self)
+        _check_horizon(self)
         _check_algorithms(self)
         if self.algorithm == "none" and not self.evaluation.baselines + self.evaluation.planners:
             raise ValueError(
@@ -212,6 +213,16 @@ def _check_fleets(study: Study) -> None:
                 f"{where} {max(values)}, and algorithm is {algorithm!r}, which trains for one UAV without depots; "
                 "set algorithm = 'none'"
             )
+
+
+def _check_horizon(study: Study) -> None:
+    """Check that planners which know nothing but lifetimes are not asked about episodes that no failure ends."""
+    asked = [name for name in study.evaluation.planners if name in CLAIRVOYANT]
+    if study.params.end == "horizon" and asked:
+        raise ValueError(
+            f"evaluation.planners has {asked[0]!r}, which is about the first failure, and params.end is 'horizon'; give "
+            "planners = ['rollout'] or []"
+        )
 
 
 def _check_algorithms(study: Study) -> None:
