@@ -72,6 +72,16 @@ def test_weights(episode):
     assert_allclose(measure(HORIZON, layout, episode, by_slot).in_service, 2 / 3)
 
 
+def test_slots_that_count_as_long_as_they_last(episode):
+    """The third and the fourth slot, in which two devices live, last 1.5 s and 11.5 s, the latter after the horizon."""
+    measures = measure(HORIZON, two_uavs(), episode, by_time=True)
+    assert_allclose(measures.in_service, (300 + (613 - 300) * 2 / 3) / 613, rtol=1e-6)
+    assert_allclose(measures.mean_age, 300 / (3 * 300 + 2 * (613 - 300)), rtol=1e-6)
+    assert measures.age_95 == 1
+    shorter = measure(HORIZON, two_uavs(), episode, jnp.zeros((6, 3)).at[2, 0].set(1.0).at[0, 2].set(1.0), by_time=True)
+    assert_allclose(shorter.in_service, 1)
+
+
 def test_the_service_counts_until_the_horizon(episode):
     """The horizon is 613 s after the start; the last slot ends later."""
     result = rollout(tour_policy(jnp.array(TOUR)), HORIZON, two_uavs(), KEY)

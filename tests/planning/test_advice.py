@@ -71,7 +71,7 @@ def test_what_if_has_every_repair_and_removal(scenario, advice):
 def test_advising_again_compiles_nothing(scenario):
     """One compilation serves every state, layout and setting of the same sizes."""
     params, layout, state = scenario
-    jitted = (advice_module._try_candidates, advice_module._lifetimes)
+    jitted = (advice_module._try_candidates, advice_module._play_layouts)
     advise(POLICY, params, layout, state, samples=4, what_if=True)
     compiled = [function._cache_size() for function in jitted]
     other_params, other_layout, other_state = mid_life(6, 6, uav_speed_m_s=8.0)

@@ -19,7 +19,8 @@ _HIGH_SHARE = 0.95
 class ServiceMeasures:
     """Measures of one episode.
 
-    A device-slot is one device in one slot that took place, judged by the state after the slot.
+    A device-slot is one device in one slot that took place; it is what the state after the slot says. All count the same,
+    or each as long as its slot.
 
     Attributes:
         first_failure_slot: number of slots completed when the first device failed, -1 if none did.
@@ -50,6 +51,7 @@ def measure(
     weight: Float[Array, " n"] | Float[Array, "H n"] | None = None,
     *,
     start: State | None = None,
+    by_time: bool = False,
 ) -> ServiceMeasures:
     """Measure an episode.
 
@@ -60,15 +62,17 @@ def measure(
         weight: weight of each device in ``in_service``, the same in all slots or one row per slot, e.g. of its traffic; by
             default its priority. Padding weighs nothing.
         start: the state before the first of the slots; by default the initial one.
+        by_time: whether a device-slot counts as long as its slot lasts, until the horizon if there is one. Slots in which
+            every device is served are short: of many such slots, an average over slots says little.
     """
     happened = trace.played & (trace.outcome.cause != Cause.UAV)
     present = jnp.ones(layout.n_devices, bool) if layout.present is None else layout.present
-    weight = layout.service_weight() if weight is None else jnp.where(present, weight, 0.0)
-    weight = jnp.where(happened[:, None], weight, 0.0)
+    counts = jnp.where(happened, _seconds(params, trace) if by_time else 1.0, 0.0)[:, None]
+    weight = counts * (layout.service_weight() if weight is None else jnp.where(present, weight, 0.0))
     serves = jax.vmap(lambda state: in_service(params, layout, state))(trace.state)
     total = jnp.sum(weight)
-    works = happened[:, None] & present & (trace.state.failed_at < 0)
-    mean_age, age_95 = _ages(trace.state.age, works)
+    works = present & (trace.state.failed_at < 0)
+    mean_age, age_95 = _ages(trace.state.age, jnp.where(works, counts, 0.0))
     slot, cause = _first_failure(trace, happened)
     uavs = uav_slots(params, layout, trace, start)
     return ServiceMeasures(
@@ -83,13 +87,22 @@ def measure(
     )
 
 
-def _ages(age: Int[Array, "H n"], counts: Bool[Array, "H n"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return the mean and the 95th percentile (nearest rank) of the ages that count; NaN if none does."""
-    number = jnp.sum(counts)
-    mean = jnp.sum(jnp.where(counts, age, 0)) / number
-    ordered = jnp.sort(jnp.where(counts, age.astype(jnp.float32), jnp.inf), axis=None)
-    rank = jnp.ceil(_HIGH_SHARE * number - 1e-3).astype(jnp.int32)
-    return mean, jnp.where(number > 0, ordered[jnp.maximum(rank - 1, 0)], jnp.nan)
+def _seconds(params: Params, trace: Trace) -> Float[Array, " H"]:
+    """Return how long each slot lasts, s, what is behind the horizon left out."""
+    duration = trace.outcome.duration
+    if params.end != "horizon":
+        return duration
+    begins = trace.state.elapsed - duration
+    return jnp.clip(params.horizon_s - begins, 0.0, duration)
+
+
+def _ages(age: Int[Array, "H n"], counts: Float[Array, "H n"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return the mean and the 95th percentile (nearest rank) of ages that count differently much; NaN if none does."""
+    total = jnp.sum(counts)
+    order = jnp.argsort(age, axis=None)
+    reaches = jnp.cumsum(counts.reshape(-1)[order]) >= _HIGH_SHARE * total * (1.0 - 1e-5)
+    high = age.reshape(-1)[order][jnp.argmax(reaches)]
+    return jnp.sum(counts * age) / total, jnp.where(total > 0, high.astype(jnp.float32), jnp.nan)
 
 
 def _first_failure(trace: Trace, happened: Bool[Array, " H"]) -> tuple[Int[Array, ""], Int[Array, ""]]:
@@ -138,15 +151,15 @@ def uav_slots(params: Params, layout: Layout, trace: Trace, start: State | None 
     flight = fleet.flying_power_w * (distance / fleet.speed_m_s)
     lost = jnp.maximum(energy - after.uav_energy, 0.0)
     nowhere = jnp.full(flew.shape, -1, jnp.int32)
-    if layout.depots is None:
+    if (depots := layout.depots) is None:
         return UavSlots(flew, nowhere, lost, jnp.zeros_like(lost), jnp.zeros_like(flew))
-    stands = jax.vmap(lambda position: stands_at(layout.depots, position))(after.uav_position)
+    stands = jax.vmap(lambda position: stands_at(depots, position))(after.uav_position)
     # Above a device that is at a depot, a UAV hovers if it started: then it lost energy.
     to_device = trace.action.reshape(flew.shape) < layout.n_devices
     stands &= ~(after.grounded | (to_device & (lost > 0)))[..., None]
     landed = jnp.any(stands, axis=-1)
     refilled = jnp.where(landed, jnp.maximum(after.uav_energy - (energy - flight), 0.0), 0.0)
-    swaps = jnp.any(stands & (layout.depots.kind == DepotKind.SWAP), axis=-1)
+    swaps = jnp.any(stands & (depots.kind == DepotKind.SWAP), axis=-1)
     return UavSlots(
         flew=flew,
         depot=jnp.where(landed, jnp.argmax(stands, axis=-1).astype(jnp.int32), nowhere),
