@@ -67,7 +67,7 @@ def measure(
     """
     happened = trace.played & (trace.outcome.cause != Cause.UAV)
     present = jnp.ones(layout.n_devices, bool) if layout.present is None else layout.present
-    counts = jnp.where(happened, _seconds(params, trace) if by_time else 1.0, 0.0)[:, None]
+    counts = jnp.where(happened, seconds_until_horizon(params, trace) if by_time else 1.0, 0.0)[:, None]
     weight = counts * (layout.service_weight() if weight is None else jnp.where(present, weight, 0.0))
     serves = jax.vmap(lambda state: in_service(params, layout, state))(trace.state)
     total = jnp.sum(weight)
@@ -87,8 +87,8 @@ def measure(
     )
 
 
-def _seconds(params: Params, trace: Trace) -> Float[Array, " H"]:
-    """Return how long each slot lasts, s, what is behind the horizon left out."""
+def seconds_until_horizon(params: Params, trace: Trace) -> Float[Array, " H"]:
+    """Return how long each slot of an episode lasts, s; what is behind the horizon, if there is one, does not count."""
     duration = trace.outcome.duration
     if params.end != "horizon":
         return duration

@@ -73,6 +73,11 @@ class Plan:
     service: Mapping[str, Float[np.ndarray, " D"]] | None = None
     service_bound: float | None = None
 
+    @property
+    def as_in_paper(self) -> bool:
+        """Whether the scenario is one of the paper's: one UAV, no depots, and the first failure is the end."""
+        return is_alone(self.layout) and self.service is None
+
 
 def make_plan(
     params: Params, layout: Layout, draws: Key[Array, " D"], *, width: int = WIDTH, samples: int = SAMPLES
