@@ -17,7 +17,7 @@ import numpy as np
 from reports import write_report
 
 from uavmec_jax.env.params import Params
-from uavmec_jax.planning.beam import horizon
+from uavmec_jax.planning.fleet_demand import horizon
 from uavmec_jax.planning.parallel import beam_episodes, bound_scenarios, rollout_planner_episodes
 from uavmec_jax.planning.rollout_planner import SAMPLES
 from uavmec_jax.scenarios.seeds import held_out_draws, layout_for_seed

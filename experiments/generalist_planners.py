@@ -18,7 +18,7 @@ import jax
 import numpy as np
 from reports import write_report
 
-from uavmec_jax.planning.beam import horizon
+from uavmec_jax.planning.fleet_demand import horizon
 from uavmec_jax.planning.heuristics import HEURISTICS
 from uavmec_jax.planning.parallel import beam_episodes, policy_episodes, rollout_planner_episodes
 from uavmec_jax.planning.rollout_planner import SAMPLES

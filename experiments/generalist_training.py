@@ -33,7 +33,8 @@ from uavmec_jax.env.generator import ScenarioDistribution, scenario_from_draw
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import rollouts, tour_policy, trace, volume_table
-from uavmec_jax.planning.beam import WIDTH, beam_search, horizon, longest
+from uavmec_jax.planning.beam import WIDTH, beam_search
+from uavmec_jax.planning.fleet_demand import horizon, longest
 from uavmec_jax.planning.parallel import spread
 from uavmec_jax.runs.results_folder import load_results
 from uavmec_jax.runs.run_plan import plan_run

@@ -13,11 +13,15 @@ from tests.planning.instances import SLOTS, small_instance, traced
 from tests.small_scenarios import three_devices
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import rollout, volume_table
-from uavmec_jax.planning.beam import beam_search, horizon
-from uavmec_jax.planning.bound import _refuted, upper_bound
+from uavmec_jax.planning.beam import beam_search
+from uavmec_jax.planning.bound import upper_bound
+from uavmec_jax.planning.fleet_demand import horizon
 from uavmec_jax.planning.flight import Rounds
 from uavmec_jax.planning.heuristics import HEURISTICS
+from uavmec_jax.planning.hover_sets import ListedHoverSets
 from uavmec_jax.planning.parallel import beam_episodes, bound_scenarios, heuristic_episodes, rollout_planner_episodes
+from uavmec_jax.planning.refutation import Refuter
+from uavmec_jax.planning.requirements import Features, Rows
 from uavmec_jax.planning.rollout_planner import rollout_planner
 from uavmec_jax.scenarios.seeds import layout_for_seed
 
@@ -109,12 +113,17 @@ def test_no_lifetime_exceeds_the_horizon():
 
 
 def test_refutation_needs_multipliers_that_prove_it():
-    # Two slots, two hover points: device 0 needs both slots at the first, device 1 needs one at the second.
-    rows = np.zeros((2, 2, 2))
-    rows[0, :, 0] = -1.0
-    rows[1, :, 1] = -1.0
-    assert _refuted(rows, np.array([-2.0, -1.0]))
-    assert not _refuted(rows, np.array([-1.0, -1.0]))
+    # Two slots, two hover points: device 0 needs every slot at the first, device 1 some at the second.
+    sets = ListedHoverSets(
+        1, np.eye(2, dtype=bool), np.ones((2, 2)), *np.ones((2, 2, 2)), may_be_empty=False, may_decline=False
+    )
+    rows = Rows(features := Features(slots=2, devices=2, sizes=sets.sizes))
+    slots = np.arange(2)
+    rows.add(-1.0, (features.service(slots, np.zeros(2, int)), np.full(2, -1.0)))
+    rows.add(-1.0, (features.service(slots, np.ones(2, int)), np.full(2, -1.0)))
+    assert not Refuter(sets).refutes(rows.build(np.ones(2, int)))
+    rows.add(-2.0, (features.service(slots, np.zeros(2, int)), np.full(2, -1.0)))
+    assert Refuter(sets).refutes(rows.build(np.ones(2, int)))
 
 
 def test_rounds_are_the_shortest_paths():

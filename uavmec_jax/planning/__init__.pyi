@@ -3,11 +3,11 @@ from .advice import Candidate as Candidate
 from .advice import advise as advise
 from .beam import Tour as Tour
 from .beam import beam_search as beam_search
-from .beam import horizon as horizon
 from .bound import upper_bound as upper_bound
 from .bound import upper_bounds as upper_bounds
 from .changes import WhatIf as WhatIf
 from .deadlines import earliest_deadline as earliest_deadline
+from .fleet_demand import horizon as horizon
 from .forecast import Forecast as Forecast
 from .forecast import make_forecast as make_forecast
 from .heuristics import HEURISTICS as HEURISTICS

@@ -28,9 +28,9 @@ from jaxtyping import Array, ArrayLike, Bool, Int, Num
 from uavmec_jax.env.dynamics import Cause, Outcome, State, initial_state, transition
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
-from uavmec_jax.planning import demand, fleet_demand
-from uavmec_jax.planning.beam_score import Problem, ValueFn, counting_bound, dominated, make_problem, score
+from uavmec_jax.planning.beam_score import Problem, ValueFn, dominated, make_problem, score
 from uavmec_jax.planning.fleet_deadlines import earliest_deadline
+from uavmec_jax.planning.fleet_demand import counting_bound
 
 WIDTH = 64
 """States kept per slot by default. A beam four times as wide lengthens one lifetime in 400, by one slot."""
@@ -68,33 +68,6 @@ class _Beam(NamedTuple):
     best_tour: Int[Array, "H *K"]
 
 
-def horizon(params: Params, layouts: Layout) -> int:
-    """Return the number of slots to plan for: a power of two, at least 64, that no lifetime exceeds.
-
-    Args:
-        params: leaves ``[B]``.
-        layouts: leaves ``[B, n]``.
-    """
-    needed = int(jnp.max(longest(params, layouts)))
-    return max(64, 1 << (needed - 1).bit_length())
-
-
-@jax.jit
-@jax.vmap
-def longest(params: Params, layout: Layout) -> Int[Array, ""]:
-    """Return the slots ``[B]`` that the UAVs' energy pays for if each is as short as can be; leaves ``[B]``, ``[B, n]``.
-
-    One UAV at a time hovers. Where a depot helps, only the time limit ends an episode for certain.
-    """
-    least = jnp.full((1, layout.n_devices), params.task_volume_range_bytes[0], jnp.float32)
-    shortest = jnp.min(fleet_demand.slot_costs(params, layout, least).duration)
-    base, _ = demand.flight_power(fleet_demand.best_uav(params, layout))
-    start = initial_state(params, layout)
-    affordable = jnp.sum(start.uav_energy) / jnp.maximum(base * shortest, 1e-3) + 2
-    affordable = jnp.where(fleet_demand.refills(layout, start), jnp.inf, affordable)
-    return jnp.minimum(affordable, params.max_slots).astype(jnp.int32)
-
-
 def beam_search(
     params: Params,
     layout: Layout,
@@ -108,7 +81,7 @@ def beam_search(
     Args:
         params: scenario parameters.
         layout: the devices.
-        volumes: bytes, the tasks of every slot; ``H`` from :func:`horizon`.
+        volumes: bytes, the tasks of every slot; ``H`` from :func:`fleet_demand.horizon`.
         width: states kept per slot; static.
         upper_bound: slots, a known upper bound on the lifetime, from which the search then starts.
         value_fn: scores the states that are not pruned with a proof, e.g. a learned critic; by default, the score is

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
-from uavmec_jax.env.dynamics import State, initial_state, slots_to_expiry
-from uavmec_jax.env.layout import Layout
+from uavmec_jax.env.dynamics import State, slots_to_expiry
+from uavmec_jax.env.layout import Layout, fleet_of
 from uavmec_jax.env.params import Params
 from uavmec_jax.planning import demand, fleet_demand
 from uavmec_jax.planning.demand import SlotCosts
@@ -25,7 +25,6 @@ class Problem(NamedTuple):
 
     Attributes:
         params: scenario parameters.
-        best: the same with the best of each UAV, for relaxations; see :func:`fleet_demand.best_uav`.
         layout: devices, UAVs and depots.
         volumes: bytes.
         costs: of every slot.
@@ -37,7 +36,6 @@ class Problem(NamedTuple):
     """
 
     params: Params
-    best: Params
     layout: Layout
     volumes: Num[Array, "H n"]
     costs: SlotCosts
@@ -50,12 +48,10 @@ class Problem(NamedTuple):
 
 def make_problem(params: Params, layout: Layout, volumes: Num[Array, "H n"], value_fn: ValueFn | None) -> Problem:
     """Return the problem of a search."""
-    best = fleet_demand.best_uav(params, layout)
-    covers = demand.coverage(best, layout)
+    covers = demand.coverage(params, layout)
     visit_share = demand.visit_shares(layout, covers)
     return Problem(
         params=params,
-        best=best,
         layout=layout,
         volumes=volumes,
         costs=fleet_demand.slot_costs(params, layout, volumes),
@@ -74,51 +70,6 @@ def _nominal_round_length(layout: Layout, visit_share: Float[Array, " n"]) -> Fl
     pairs = disconnected[:, None] & disconnected & ~jnp.eye(disconnected.shape[0], dtype=bool)
     nearest = jnp.min(jnp.where(pairs, distance, jnp.inf), axis=1)
     return jnp.sum(jnp.where(disconnected & jnp.isfinite(nearest), nearest * visit_share, 0.0))
-
-
-def counting_bound(params: Params, layout: Layout, costs: SlotCosts) -> Int[Array, ""]:
-    """Return an upper bound on the lifetime by counting: the visits needed must fit into the slots.
-
-    A lifetime of k slots means that k - 1 slots were survived and that, unless a depot helps, the energy of a UAV sufficed
-    for the k-th.
-
-    Args:
-        params: scenario parameters.
-        layout: devices, UAVs and depots.
-        costs: from :func:`fleet_demand.slot_costs`.
-    """
-    state, alone = initial_state(params, layout), fleet_demand.is_alone(layout)
-    best = fleet_demand.best_uav(params, layout)
-    visit_share = demand.visit_shares(layout, demand.coverage(best, layout))
-    slots, shortest = costs.work.shape[0], jnp.min(costs.duration, axis=1)
-    base, extra = demand.flight_power(best)
-    distance = jnp.min(jnp.linalg.norm(layout.position - state.uav_position[:, None], axis=-1))
-    paid = jnp.cumsum(base * shortest) + extra * distance / best.uav_speed_m_s
-    energy, helped = jnp.sum(jnp.where(state.grounded, 0.0, state.uav_energy)), fleet_demand.refills(layout, state)
-    servers = jnp.sum(~state.grounded)
-
-    def feasible(lifetime: Int[Array, ""]) -> Bool[Array, ""]:
-        need = demand.battery_demand(layout, costs, 0, lifetime - 1)
-        battery_visits, _, infeasible = demand.battery_visits(layout, need, state.battery)
-        age_visits, _ = demand.age_visits(params, layout, state.age, lifetime - 1)
-        started = lifetime - jnp.where(params.count_unfinished_slot, 1, 0)
-        affordable = (started == 0) | (paid[started - 1] <= energy * (1.0 + 1e-5))
-        room = lifetime - 1
-        if not alone:
-            least = jnp.min(jnp.where(jnp.arange(slots) < lifetime - 1, shortest, jnp.inf))
-            room = fleet_demand.visits_in(params, layout, state, lifetime - 1, least)
-        return (
-            (affordable | helped)
-            & ~jnp.any(infeasible)
-            & (jnp.sum(visit_share * jnp.maximum(battery_visits, age_visits)) <= room + 1e-3)
-            & ~demand.misses_deadline(
-                params, layout, visit_share, state.age, lifetime - 1, 1 if alone else servers[None]
-            )
-        )
-
-    lifetimes = jnp.arange(1, slots + 1)
-    longest_feasible = jnp.max(jnp.where(jax.lax.map(feasible, lifetimes), lifetimes, 1))
-    return jnp.minimum(longest_feasible, params.max_slots).astype(jnp.int32)
 
 
 def score(
@@ -144,9 +95,10 @@ def score(
     ) & (remaining >= 0)
     if problem.value_fn is not None:
         return problem.value_fn(params, layout, states), lost
-    _, extra = demand.flight_power(problem.best)
+    fleet = fleet_of(params, layout)
+    _, extra = demand.flight_power(params, fleet)
     expiry = jnp.maximum(slots_to_expiry(params), 1)
-    flights = extra * problem.round_length / problem.best.uav_speed_m_s * remaining / expiry
+    flights = jnp.min(extra * problem.round_length / fleet.speed_m_s) * remaining / expiry
     # Devices that are served from one hover point share their visits.
     shared = jnp.sum(jnp.maximum(demand.max_by_hover_point(problem.hover_point, visits + exact), 0.0), axis=-1)
     pressure = 0.5 * shared / jnp.maximum(room, 1) + flights / jnp.maximum(spare, 1.0) + crowded
@@ -164,14 +116,16 @@ def _what_is_left(
     """
     params, layout = problem.params, problem.layout
     remaining, shortest = target - 1 - slot, jnp.min(problem.costs.duration, axis=1)
-    base, _ = demand.flight_power(problem.best)
+    base, _ = demand.flight_power(params, fleet_of(params, layout))
     index = jnp.arange(problem.volumes.shape[0])
     paid = (index >= slot) & (index < target - jnp.where(params.count_unfinished_slot, 1, 0))
     hovering = base * jnp.sum(jnp.where(paid, shortest, 0.0))
+    each = states.uav_energy * (1.0 + 1e-5) - hovering
     if fleet_demand.is_alone(layout):
-        return remaining, 1, states.uav_energy[:, 0] * (1.0 + 1e-5) - hovering, 0.0
-    energy = jnp.sum(jnp.where(states.grounded, 0.0, states.uav_energy), axis=-1)
-    spare = jnp.where(fleet_demand.refills(layout, states), jnp.inf, energy * (1.0 + 1e-5) - hovering)
+        return remaining, 1, each[:, 0], 0.0
+    # Without depots, a UAV that hovers in the last slot has hovered in all slots before.
+    longest = jnp.max(jnp.where(states.grounded, -1.0, each), axis=-1)
+    spare = jnp.full(longest.shape, jnp.inf) if layout.n_depots else longest
     least = jnp.min(jnp.where((index >= slot) & (index < target - 1), shortest, jnp.inf))
     room = fleet_demand.visits_in(params, layout, states, remaining, least)
     servers = jnp.sum(~states.grounded, axis=-1, keepdims=True)

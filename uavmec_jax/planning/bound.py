@@ -1,89 +1,54 @@
 """A certified upper bound: the lifetime that no policy exceeds on one layout with one volume draw.
 
-A lifetime of k slots requires that every device survives k - 1 slots and that the UAV's energy pays for k slots. Both
-requirements are relaxed to a linear program over ``x[t, a]``, the share of slot t that the UAV spends above device a::
+A lifetime of k slots requires that every device survives k - 1 slots. Without depots it also requires that a UAV hovers in
+all k slots: all that have not been grounded hover in every slot, and who does not start is grounded. With depots nobody has
+to: a UAV that has landed starts into the next slot for nothing, even where there is nothing left to get.
 
-    rows @ x <= limits,    sum_a x[t, a] = 1,    x >= 0.
+Both requirements are relaxed to a linear program over ``x[t, c]``, the share of slot t in which the fleet uses the hover set
+c (:mod:`uavmec_jax.planning.hover_sets`)::
 
-HiGHS (Huangfu and Hall 2018, through SciPy) minimises the largest violation of the rows. The certificate is its vector of
-dual multipliers ``y >= 0``: if ``sum_t min_a (y @ rows)[t, a] > y @ limits``, then no ``x`` whatsoever satisfies the rows,
-and no policy lives for k slots. This inequality (a Farkas certificate) is checked here, so the bound does not depend on the
-tolerances of the solver. If k slots are refuted, so is every longer lifetime, and the bound is found by bisection.
+    rows @ x <= limits,    sum_c x[t, c] = 1,    x >= 0.
 
-The relaxation drops what is not linear: flight time does not lengthen a slot, uploads cost what they cost from right above
-the device, and the UAV's flights cost at least what :mod:`uavmec_jax.planning.flight` derives for the rounds through the
-devices without communication. Integrality is kept in the rows that count whole visits; measured on top of them, the
-mixed-integer program gained nothing.
+It is refuted with a certificate (:mod:`uavmec_jax.planning.refutation`). If k slots are refuted, so is every longer lifetime,
+and the bound is found by bisection. What a policy does in a slot corresponds to the set of the points above which UAVs hover,
+and it satisfies every row:
+
+- *Devices.* Whoever is served is in the set's range. A slot is as long as its slowest device; flights only lengthen it, and
+  an upload is as short as to the best point of the set. A battery spends its standby power for that long, and the work or
+  at least an upload from right below the UAV (:func:`uavmec_jax.planning.device_rows.add_battery_rows`, which also counts
+  whole visits). Data that do not expire are collected in every window of ``slots_to_expiry`` slots.
+- *Energy without depots.* The UAVs in the air in a slot have been in the air in all slots before. If they are ``j`` or more,
+  one of them has a battery that is no better than the ``j``-th best, and it has paid for all these slots. So hover sets of
+  ``j`` or more points are in use no longer than the ``j``-th best battery lasts, and never after it is bound to be empty.
+  Nothing is said about a UAV that is grounded early.
+- *Energy with depots.* The energy in all batteries when a slot begins is at most their capacity; it pays for those that
+  hover in the slot; and it grows by what depots give in the slot to those that do not hover, which helps from the next slot
+  on. A swap gives at most a full battery, to as many UAVs as there are pads and, over the whole lifetime, packs; charging
+  gives at most its power for the length of the slot, which here has to be the longest that it can have. This accounts for
+  every window of slots: what is spent in it was in the batteries before, or was given in it.
+- *Flights* cost one UAV at least what :mod:`uavmec_jax.planning.flight` derives for the rounds through the devices without
+  communication, and each UAV of a fleet without depots at least its way to the nearest device.
+
+The best of a fleet stands for all of it only in its signal range and in how fast it charges; batteries are counted in seconds
+of hovering at each UAV's own least power. Integrality is kept in the rows that count whole visits; measured on top of them
+with one UAV, the mixed-integer program gained nothing.
 """
-
-from dataclasses import dataclass
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Num
-from scipy.optimize import linprog
+from jaxtyping import Array, Int, Num
 
-from uavmec_jax.env.dynamics import slots_to_expiry
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
-from uavmec_jax.planning import demand
-from uavmec_jax.planning.beam_score import counting_bound
+from uavmec_jax.planning.bound_instance import Instance, instances
+from uavmec_jax.planning.device_rows import add_age_rows, add_battery_rows
+from uavmec_jax.planning.energy_rows import add_depot_rows, add_endurance_rows, endurance
 from uavmec_jax.planning.flight import Rounds
-
-_SLACK = 1e-5
-"""Relative tolerance for the single precision of the slot's physics, in favour of the network."""
-
-_ROUNDING = 1e-10
-"""Relative tolerance for the double precision of the certificate's check."""
-
-_SOLVED = 0
-"""Status of SciPy's ``linprog`` for an optimal solution."""
-
-
-@dataclass(frozen=True)
-class _Instance:
-    """One scenario with one volume draw, in double precision; see :class:`demand.SlotCosts` and :class:`Layout`."""
-
-    position: Float[np.ndarray, "n 2"]
-    capacity: Float[np.ndarray, " n"]
-    standby_power: Float[np.ndarray, " n"]
-    has_power: Bool[np.ndarray, " n"]
-    has_comms: Bool[np.ndarray, " n"]
-    covers: Bool[np.ndarray, "n n"]
-    duration: Float[np.ndarray, "H n"]
-    work: Float[np.ndarray, "H n"]
-    upload: Float[np.ndarray, "H n"]
-    counting_bound: int
-    base_power: float
-    extra_power: float
-    slots_to_expiry: int
-    unfinished: int
-    uav_battery: float
-    uav_speed: float
-
-
-@jax.jit
-@jax.vmap
-def _quantities(params: Params, layout: Layout, volumes: Num[Array, "H n"]) -> dict[str, Array]:
-    """Compute the fields of :class:`_Instance` for ``B`` scenarios; leaves ``[B, ...]``."""
-    costs = demand.slot_costs(params, layout, volumes)
-    base, extra = demand.flight_power(params)
-    from_layout = ("position", "capacity", "standby_power", "has_power", "has_comms")
-    return {name: getattr(layout, name) for name in from_layout} | {
-        "covers": demand.coverage(params, layout),
-        "duration": costs.duration,
-        "work": costs.work,
-        "upload": costs.upload,
-        "counting_bound": counting_bound(params, layout, costs),
-        "base_power": base,
-        "extra_power": extra,
-        "slots_to_expiry": slots_to_expiry(params),
-        "unfinished": jnp.where(params.count_unfinished_slot, 1, 0),
-        "uav_battery": params.uav_battery_j,
-        "uav_speed": params.uav_speed_m_s,
-    }
+from uavmec_jax.planning.hover_sets import HoverSets, ListedHoverSets, LooseHoverSets
+from uavmec_jax.planning.refutation import Refuter
+from uavmec_jax.planning.requirements import Features, Requirements, Rows
 
 
 def upper_bound(params: Params, layout: Layout, volumes: Num[Array, "H n"], reached: int = 1) -> int:
@@ -91,12 +56,12 @@ def upper_bound(params: Params, layout: Layout, volumes: Num[Array, "H n"], reac
 
     Args:
         params: scenario parameters.
-        layout: the devices.
-        volumes: bytes, ``H`` from :func:`uavmec_jax.planning.beam.horizon`.
+        layout: the devices, the UAVs and the depots.
+        volumes: bytes, ``H`` from :func:`uavmec_jax.planning.fleet_demand.horizon`.
         reached: a lifetime that some policy reaches; the search starts there and is short if it is optimal.
 
     Raises:
-        ValueError: the volumes end before a lifetime may.
+        ValueError: the volumes end before a lifetime may, or episodes do not end with the first failure.
     """
     params, layout, volumes = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], (params, layout, volumes))
     return int(upper_bounds(params, layout, volumes, np.array([reached]))[0])
@@ -106,109 +71,82 @@ def upper_bounds(
     params: Params, layouts: Layout, volumes: Num[Array, "B H n"], reached: Num[np.ndarray, " B"]
 ) -> Int[np.ndarray, " B"]:
     """Return the :func:`upper_bound` of each of ``B`` scenarios; every leaf has a leading ``B``."""
-    chex.assert_shape(volumes, (len(reached), None, layouts.capacity.shape[1]))
-    batch = {name: np.asarray(leaf) for name, leaf in _quantities(params, layouts, volumes).items()}
-    slots = volumes.shape[1]
-    if np.any((batch["counting_bound"] >= slots) & (slots < np.asarray(params.max_slots))):
-        raise ValueError(f"volumes are given for {slots} slots, and lifetimes may be longer; give more")
-    batch = {name: leaf.astype(float) if leaf.dtype == np.float32 else leaf for name, leaf in batch.items()}
-    instances = (
-        _Instance(**{name: leaf[b] if leaf.ndim > 1 else leaf[b].item() for name, leaf in batch.items()})
-        for b in range(len(reached))
-    )
-    bounds = [_bound(instance, int(low)) for instance, low in zip(instances, reached, strict=True)]
+    chex.assert_shape(volumes, (len(reached), None, layouts.n_devices))
+    if params.end != "first_failure":
+        raise ValueError(f"end is {params.end!r}; upper bounds on lifetimes are for 'first_failure'")
+    slots, max_slots = volumes.shape[1], np.broadcast_to(params.max_slots, len(reached))
+    bounds = []
+    for instance, low, limit in zip(instances(params, layouts, volumes), reached, max_slots, strict=True):
+        if instance.counting_bound >= slots and slots < limit:
+            raise ValueError(f"volumes are given for {slots} slots, and lifetimes may be longer; give more")
+        bounds.append(_Bound(instance).search(int(low)))
     return np.array(bounds, np.int32)
 
 
-def _bound(instance: _Instance, low: int) -> int:
-    """Return the longest lifetime from ``low`` on that is not refuted."""
-    rounds = Rounds(instance.position, instance.covers, ~instance.has_comms, instance.slots_to_expiry)
-    high = instance.counting_bound
-    if low < high and not _feasible(instance, rounds, low + 1):
+class _Bound:
+    """The search for the bound of one instance."""
+
+    def __init__(self, instance: Instance) -> None:
+        self._instance = instance
+        self._sets = _hover_sets(instance)
+        self._refuter = Refuter(self._sets)
+        position, may_land = instance.position, instance.depots is not None
+        way = np.linalg.norm(position[instance.hover_points, None] - instance.start, axis=-1).min(axis=0)
+        self._nearest = np.zeros(instance.uavs) if may_land else way
+        disconnected, expiry = ~instance.has_comms, instance.slots_to_expiry
+        self._rounds = Rounds(position, instance.covers, disconnected, expiry, instance.start[0], may_land=may_land)
+
+    def search(self, low: int) -> int:
+        """Return the longest lifetime from ``low`` on that is not refuted."""
+        high = self._instance.counting_bound
+        if low < high and not self._feasible(low + 1):
+            return low
+        low = min(low + 1, high) if low < high else low
+        while low < high:
+            middle = (low + high + 1) // 2
+            low, high = (middle, high) if self._feasible(middle) else (low, middle - 1)
         return low
-    low = min(low + 1, high) if low < high else low
-    while low < high:
-        middle = (low + high + 1) // 2
-        low, high = (middle, high) if _feasible(instance, rounds, middle) else (low, middle - 1)
-    return low
 
+    def _feasible(self, lifetime: int) -> bool:
+        """Return whether a lifetime is not refuted."""
+        requirements = self._requirements(lifetime)
+        return requirements is not None and not self._refuter.refutes(requirements)
 
-def _feasible(instance: _Instance, rounds: Rounds, lifetime: int) -> bool:
-    """Return whether the relaxation admits a lifetime."""
-    survive, paid = lifetime - 1, lifetime - instance.unfinished
-    slots = max(survive, paid, 1)
-    battery = _battery_rows(instance, survive, slots)
-    if battery is None:
-        return False
-    rows, limits = battery
-    age = _age_rows(instance, survive, slots)
-    energy = np.zeros((1, *rows.shape[1:]))
-    energy[0, :paid] = instance.base_power * instance.duration[:paid]
-    flights = instance.extra_power * rounds.min_distance(survive) / instance.uav_speed
-    budget = instance.uav_battery * (1.0 + _SLACK) - flights * (1.0 - _SLACK)
-    if budget <= 0.0:
-        return False
-    rows = np.concatenate([rows, age, energy / budget])
-    return not _refuted(rows, np.concatenate([limits, np.full(len(age), -1.0), [1.0]]))
-
-
-def _refuted(rows: Float[np.ndarray, "R T n"], limits: Float[np.ndarray, " R"]) -> bool:
-    """Return whether no ``x [T, n]`` with ``x >= 0`` and ``x[t].sum() = 1`` satisfies ``rows @ x <= limits``."""
-    count, slots, n = rows.shape
-    flat = rows.reshape(count, slots * n)
-    solution = linprog(
-        np.append(np.zeros(slots * n), 1.0),
-        A_ub=np.column_stack([flat, np.full(count, -1.0)]),
-        b_ub=limits,
-        A_eq=np.column_stack([np.kron(np.eye(slots), np.ones(n)), np.zeros(slots)]),
-        b_eq=np.ones(slots),
-        bounds=[*[(0.0, None)] * (slots * n), (None, None)],
-        method="highs-ds",
-    )
-    if solution.status != _SOLVED:
-        return False
-    multipliers = np.maximum(-solution.ineqlin.marginals, 0.0)
-    least = np.sum(np.min((multipliers @ flat).reshape(slots, n), axis=1))
-    return bool(least > multipliers @ limits + _ROUNDING * np.abs(multipliers) @ np.abs(limits))
-
-
-def _battery_rows(
-    instance: _Instance, survive: int, slots: int
-) -> tuple[Float[np.ndarray, "R T n"], Float[np.ndarray, " R"]] | None:
-    """Return the rows and limits of the batteries: energy, and whole visits with the largest savings counted first.
-
-    ``None`` if a battery runs out even with a service in every slot.
-    """
-    n = len(instance.capacity)
-    rows, limits = [], []
-    shortest = instance.duration[:survive].min(axis=1, initial=np.inf)
-    for device in np.flatnonzero(~instance.has_power):
-        served = instance.covers[:, device]
-        capacity, standby = instance.capacity[device] * (1.0 + _SLACK), instance.standby_power[device]
-        work, upload = instance.work[:survive, device], instance.upload[:survive, device]
-        row = np.zeros((slots, n))
-        row[:survive] = standby * instance.duration[:survive] + np.where(served, upload[:, None], work[:, None])
-        rows.append(row / capacity)
-        limits.append(1.0)
-        saved = np.cumsum(np.sort(np.maximum(work - upload, 0.0))[::-1])
-        missing = np.sum(standby * shortest + work) - capacity
-        visits = 0 if missing < 0 else 1 + int(np.sum(saved <= missing))
-        if visits > survive:
+    def _requirements(self, lifetime: int) -> Requirements | None:
+        """Return what a lifetime requires; ``None`` if that is out of the question."""
+        instance, shortest = self._instance, self._sets.shortest
+        survive = lifetime - 1
+        paid = lifetime - instance.unfinished if instance.depots is None else 0
+        slots = max(survive, paid, 1)
+        rows = Rows(Features(slots, len(instance.capacity), self._sets.sizes))
+        if not add_battery_rows(rows, instance, shortest, survive):
             return None
-        if visits:
-            row = np.zeros((slots, n))
-            row[:survive] = -served.astype(float)
-            rows.append(row)
-            limits.append(-float(visits))
-    return np.array(rows).reshape(-1, slots, n), np.array(limits)
+        add_age_rows(rows, instance, survive)
+        flights = np.array([self._rounds.min_distance(survive)]) if instance.uavs == 1 else self._nearest
+        if instance.depots is not None:
+            levels = add_depot_rows(rows, instance, instance.depots, flights)
+            return rows.build(np.full(slots, instance.uavs), levels)
+        seconds = endurance(instance, flights)
+        largest = np.sum(np.cumsum(shortest[:slots])[:, None] <= seconds, axis=1)
+        if (largest[:paid] < 1).any():
+            return None
+        add_endurance_rows(rows, seconds, paid)
+        return rows.build(np.maximum(largest, 1))
 
 
-def _age_rows(instance: _Instance, survive: int, slots: int) -> Float[np.ndarray, "R T n"]:
-    """Return the rows of ``rows @ x <= -1``: any ``slots_to_expiry`` slots serve each device without communication."""
-    rows = []
-    for device in np.flatnonzero(~instance.has_comms):
-        for start in range(survive - instance.slots_to_expiry + 1):
-            row = np.zeros((slots, len(instance.capacity)))
-            row[start : start + instance.slots_to_expiry] = -instance.covers[:, device].astype(float)
-            rows.append(row)
-    return np.array(rows).reshape(-1, slots, len(instance.capacity))
+def _hover_sets(instance: Instance) -> HoverSets:
+    """Return the hover sets of an instance: listed, or if there are too many, a superset of them."""
+    points, may_be_empty = instance.hover_points, instance.depots is not None
+    covers = instance.covers[points]
+    if not instance.is_listed:
+        duration = instance.shortest[:, : min(instance.uavs, len(points)) + 1]
+        return LooseHoverSets(covers, duration, may_be_empty=may_be_empty)
+    return ListedHoverSets(
+        instance.uavs,
+        covers,
+        instance.rate[points],
+        instance.t_work,
+        instance.bits,
+        may_be_empty=may_be_empty,
+        may_decline=instance.may_decline,
+    )

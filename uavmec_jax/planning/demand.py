@@ -16,6 +16,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
 from uavmec_jax.env.channel import upload_rate
 from uavmec_jax.env.dynamics import slots_to_expiry
+from uavmec_jax.env.fleet import Fleet
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 
@@ -42,8 +43,28 @@ class SlotCosts:
 
 
 def coverage(params: Params, layout: Layout) -> Bool[Array, "n n"]:
-    """Return ``covers[a, d]``: whether a UAV hovering above device ``a`` serves device ``d``."""
-    return (_slant(params, layout) <= params.uav_signal_range_m) | jnp.eye(layout.capacity.shape[0], dtype=bool)
+    """Return ``covers[a, d]``: whether a UAV hovering above device ``a`` serves device ``d``.
+
+    Of a fleet it is the UAV with the largest signal range.
+    """
+    signal_range = params.uav_signal_range_m
+    if (fleet := layout.fleet) is not None:
+        present = True if fleet.present is None else fleet.present
+        signal_range = jnp.max(jnp.where(present, fleet.signal_range_m, 0.0))
+    return (_slant(params, layout) <= signal_range) | jnp.eye(layout.capacity.shape[0], dtype=bool)
+
+
+def upload_rates(params: Params, layout: Layout) -> Float[Array, "n n"]:
+    """Return the rates in bit/s from the hover point of each device to each device."""
+    return jax.vmap(lambda slant: upload_rate(params, slant))(_slant(params, layout))
+
+
+def work_times(
+    params: Params, layout: Layout, volumes: Num[Array, "H n"]
+) -> tuple[Float[Array, "H n"], Float[Array, " n"]]:
+    """Return the seconds that each device computes if it is not served, and those in which it then sends its results."""
+    t_compute = jnp.minimum(volumes / layout.processing_rate, params.slot_cap_s)
+    return t_compute, jnp.where(layout.has_comms, 8.0 * params.result_message_bytes / params.uplink_rate_bit_s, 0.0)
 
 
 def _slant(params: Params, layout: Layout) -> Float[Array, "n n"]:
@@ -62,10 +83,14 @@ def visit_shares(layout: Layout, covers: Bool[Array, "n n"]) -> Float[Array, " n
     the dual of the covering problem "choose hover points so that every device is covered as often as it needs", and by
     weak duality ``sum(visit_shares * visits_needed)`` is a lower bound on the number of slots.
     """
-    needy = ~layout.has_power | ~layout.has_comms
-    n_covered = jnp.sum(covers & needy, axis=1)
+    return shares_of(~layout.has_power | ~layout.has_comms, covers)
+
+
+def shares_of(subset: Bool[Array, " n"], covers: Bool[Array, "n n"]) -> Float[Array, " n"]:
+    """Return shares like those of :func:`visit_shares`, of the devices of any subset: no hover point covers more than 1."""
+    n_covered = jnp.sum(covers & subset, axis=1)
     largest = jnp.max(jnp.where(covers, n_covered[:, None], 1), axis=0)
-    return jnp.where(needy, 1.0 / largest, 0.0)
+    return jnp.where(subset, 1.0 / largest, 0.0)
 
 
 def best_hover_point(covers: Bool[Array, "n n"], subset: Bool[Array, " n"]) -> Int[Array, " n"]:
@@ -78,9 +103,8 @@ def slot_costs(params: Params, layout: Layout, volumes: Num[Array, "H n"]) -> Sl
     """Return the costs of every slot of a volume draw; ``volumes`` in bytes."""
     chex.assert_shape(volumes, (None, layout.capacity.shape[0]))
     covers = coverage(params, layout)
-    rate = jax.vmap(lambda slant: upload_rate(params, slant))(_slant(params, layout))
-    t_compute = jnp.minimum(volumes / layout.processing_rate, params.slot_cap_s)
-    t_results = jnp.where(layout.has_comms, 8.0 * params.result_message_bytes / params.uplink_rate_bit_s, 0.0)
+    rate = upload_rates(params, layout)
+    t_compute, t_results = work_times(params, layout, volumes)
 
     def durations(volumes: Num[Array, " n"], t_unserved: Float[Array, " n"]) -> Float[Array, " n"]:
         return jnp.max(jnp.where(covers, 8.0 * volumes / rate, t_unserved), axis=1)
@@ -97,11 +121,15 @@ def mean_slot(params: Params, layout: Layout) -> SlotCosts:
 
     The mean work, ``E[min(v / rate, cap)]`` over uniform volumes ``v``, is exact; the duration is that of mean work.
     """
+    return jax.tree.map(lambda leaf: leaf[0], slot_costs(params, layout, mean_volumes(params, layout)[None]))
+
+
+def mean_volumes(params: Params, layout: Layout) -> Float[Array, " n"]:
+    """Return the volumes in bytes that each device gets done in a slot on average if it is not served."""
     low, high = (jnp.asarray(bound, jnp.float32) for bound in params.task_volume_range_bytes)
     fits = jnp.clip(params.slot_cap_s * layout.processing_rate, low, high)
     done = 0.5 * (fits**2 - low**2) + (high - fits) * fits
-    volumes = jnp.where(high > low, done / jnp.maximum(high - low, 1.0), low)
-    return jax.tree.map(lambda leaf: leaf[0], slot_costs(params, layout, volumes[None]))
+    return jnp.where(high > low, done / jnp.maximum(high - low, 1.0), low)
 
 
 def idle_drain(layout: Layout, costs: SlotCosts) -> Float[Array, "*H n"]:
@@ -209,8 +237,15 @@ def max_by_hover_point(hover_point: Int[Array, " n"], value: Num[Array, "*B n"])
     return jnp.moveaxis(jax.lax.fori_loop(0, rows.shape[0], update, lowest), 0, -1)
 
 
-def flight_power(params: Params) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return ``(base, extra)`` in W: a slot costs the UAV at least ``base * duration + extra * flight_time``."""
-    saved = jnp.where(params.flight_power_adds_to_hover, 0.0, params.uav_hovering_power_w)
-    extra = params.uav_flying_power_w - saved
-    return params.uav_hovering_power_w + jnp.minimum(extra, 0.0), jnp.maximum(extra, 0.0)
+def flight_power(params: Params, fleet: Fleet | None = None) -> tuple[Float[Array, "*K"], Float[Array, "*K"]]:
+    """Return ``(base, extra)`` in W: a slot costs a UAV that hovers at least ``base * duration + extra * flight_time``.
+
+    Args:
+        params: scenario parameters.
+        fleet: the UAVs; ``None`` for the one of the parameters, whose powers are scalars.
+    """
+    flying, hovering = params.uav_flying_power_w, params.uav_hovering_power_w
+    if fleet is not None:
+        flying, hovering = fleet.flying_power_w, fleet.hovering_power_w
+    extra = flying - jnp.where(params.flight_power_adds_to_hover, 0.0, hovering)
+    return hovering + jnp.minimum(extra, 0.0), jnp.maximum(extra, 0.0)

@@ -117,8 +117,7 @@ def split_among(params: Params, layout: Layout, flies: Bool[Array, " K"]) -> Int
 
 def _needs(params: Params, layout: Layout, state: State) -> _Needs:
     """Return what the devices need for the longest horizon that the fleet can serve."""
-    best = fleet_demand.best_uav(params, layout)
-    covers, mean = demand.coverage(best, layout), fleet_demand.mean_slot(params, layout)
+    covers, mean = demand.coverage(params, layout), fleet_demand.mean_slot(params, layout)
     shortest = jnp.min(mean.duration)
     visits_in = lambda slots: fleet_demand.visits_in(params, layout, state, slots, shortest)  # noqa: E731
     slots, _ = feasible_horizon(params, layout, state, mean, demand.visit_shares(layout, covers), visits_in)

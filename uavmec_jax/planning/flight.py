@@ -24,11 +24,14 @@ class Rounds:
     """Shortest rounds of one layout through its devices without communication.
 
     Args:
-        position: ``[n, 2]`` m; the UAV starts at the origin.
+        position: ``[n, 2]`` m.
         covers: ``[n, n]`` bool, ``covers[a, d]``: a UAV hovering above ``a`` serves ``d``.
         disconnected: ``[n]`` bool, the devices without communication. Only the first :data:`MAX_ROUND_DEVICES` of them
             are considered; a round through fewer devices is no longer, so the bound remains valid.
         slots_to_expiry: slots without service after which data have expired (E above).
+        start: m, where the UAV starts; by default at the origin.
+        may_land: whether the UAV may also land at a depot, and then need not fly to a device if none falls due. (Flights to
+            depots between those to devices do not shorten a round.)
     """
 
     def __init__(
@@ -37,15 +40,19 @@ class Rounds:
         covers: Bool[np.ndarray, "n n"],
         disconnected: Bool[np.ndarray, " n"],
         slots_to_expiry: int,
+        start: Float[np.ndarray, " 2"] | None = None,
+        *,
+        may_land: bool = False,
     ) -> None:
+        from_start = np.linalg.norm(position if start is None else position - start, axis=-1)
         devices = np.flatnonzero(disconnected)[:MAX_ROUND_DEVICES]
         subsets = covers[:, devices].astype(int) @ (1 << np.arange(len(devices)))
         hover = np.flatnonzero(subsets)
         # Sets of devices are bit masks: the devices served from each of the q useful hover points, and all devices.
         self._served, self._all = subsets[hover], (1 << len(devices)) - 1
-        self._from_start = np.linalg.norm(position[hover], axis=-1)
+        self._from_start = from_start[hover]
         self._distance = np.linalg.norm(position[hover, None] - position[None, hover], axis=-1)
-        self._nearest = float(np.linalg.norm(position, axis=-1).min())
+        self._nearest = 0.0 if may_land else float(from_start.min())
         self._slots_to_expiry = slots_to_expiry
 
     def min_distance(self, slots: int) -> float:

@@ -14,10 +14,9 @@ from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.measures import ServiceMeasures, measure
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Episode, Trace, tour_policy, trace
-from uavmec_jax.planning.beam import horizon
 from uavmec_jax.planning.changes import WhatIf, layouts_to_try, rank_changes
 from uavmec_jax.planning.fleet_deadlines import earliest_deadline
-from uavmec_jax.planning.fleet_demand import is_alone
+from uavmec_jax.planning.fleet_demand import horizon, is_alone
 from uavmec_jax.planning.forecast import Forecast
 from uavmec_jax.planning.heuristics import FLEET_HEURISTICS, HEURISTICS
 from uavmec_jax.planning.parallel import (

@@ -13,7 +13,7 @@ from uavmec_jax.env.generator import ScenarioDistribution, scenario_from_draw
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.scenario import Scenario
-from uavmec_jax.planning.beam import horizon
+from uavmec_jax.planning.fleet_demand import horizon
 from uavmec_jax.planning.parallel import beam_episodes, bound_scenarios, rollout_planner_episodes
 from uavmec_jax.studies.evaluation_result import EvaluationResult, PlannerResult
 from uavmec_jax.studies.schema import Evaluation
