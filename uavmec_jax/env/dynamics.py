@@ -75,6 +75,7 @@ class Outcome:
         duration: length of the slot, s; 0 if it never started.
         first_failure: each device's share in the first failure. Shares sum to 1 if a device failed: the battery that
             runs out earliest inside the slot has all of it; devices whose data expired share it equally.
+        lasted: share of the slot that was over when the first battery ran out, 1 if none did.
     """
 
     cause: Int[Array, "*batch"]
@@ -82,6 +83,7 @@ class Outcome:
     served: Bool[Array, "*batch n"]
     duration: Float[Array, "*batch"]
     first_failure: Float[Array, "*batch n"]
+    lasted: Scalar = 1.0
 
 
 def initial_state(params: Params, layout: Layout) -> State:
@@ -267,6 +269,7 @@ def _outcome(
         served=slot.served & happens,
         duration=jnp.where(happens, slot.duration, 0.0),
         first_failure=first / jnp.maximum(jnp.sum(first), 1),
+        lasted=jnp.minimum(jnp.min(lasts), 1.0),
     )
 
 

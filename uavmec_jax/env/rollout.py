@@ -13,6 +13,7 @@ from uavmec_jax.env.generator import ScenarioDistribution, scenario_from_draw
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.scenario import Scenario, advance, draw_volumes
+from uavmec_jax.env.types import Scalar
 
 Policy = Callable[..., Array]
 """``policy(params, layout, state, key=None) -> action``, an int32 place in ``[0, n + D)``, one per UAV (``[K]``) if there
@@ -31,6 +32,7 @@ class Episode:
         cause: why it ended, a :class:`Cause` as int32; ``NONE`` if the time limit ended it.
         failed: devices that failed in the last slot.
         first_failure: each device's share in the first failure; sums to 1 unless no device failed.
+        lasted: share of the last slot that was over when the first battery ran out, 1 if none did.
         service_s: with ``end = "horizon"``, seconds until the horizon in which the devices were in service
             (:func:`dynamics.service`), mean over the devices weighted by their priorities; else ``None``.
     """
@@ -39,6 +41,7 @@ class Episode:
     cause: Int[Array, "*batch"]
     failed: Bool[Array, "*batch n"]
     first_failure: Float[Array, "*batch n"]
+    lasted: Scalar = 1.0
     service_s: Float[Array, "*batch"] | None = None
 
 
@@ -120,6 +123,7 @@ def _play(
         cause=last.outcome.cause,
         failed=last.outcome.failed,
         first_failure=last.outcome.first_failure if last.first_failure is None else last.first_failure,
+        lasted=last.outcome.lasted,
         service_s=last.service_s,
     )
     return last.actions, episode
@@ -166,6 +170,7 @@ def _initial_outcome(n: int) -> Outcome:
         served=jnp.zeros(n, bool),
         duration=jnp.float32(0),
         first_failure=jnp.zeros(n, jnp.float32),
+        lasted=jnp.float32(1),
     )
 
 

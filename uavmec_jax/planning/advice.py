@@ -20,7 +20,7 @@ from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Episode, Policy, rollout_from, trace_from
 from uavmec_jax.planning.changes import WhatIf, layouts_to_try, rank_changes
 from uavmec_jax.planning.forecast import SAMPLES, Forecast
-from uavmec_jax.planning.rollout_planner import candidates_of, prefer, try_candidates
+from uavmec_jax.planning.rollout_planner import candidates_of, prefer, try_candidates, values_of
 
 _RETURN_SAMPLES = 32
 """Futures in which it is looked up when the UAVs return to a depot."""
@@ -37,8 +37,9 @@ class Candidate:
         device: index of the place from 0: a device, or behind the devices a depot.
         lifetime: slots, mean over the futures if the UAV flies there next and the policy decides from then on.
         behind: slots by which the best candidate's value exceeds this one's on the same futures. The value of a future is
-            its lifetime minus the price of its first failure, if the layout's traffic has prices. With
-            ``end = "horizon"`` it is the share of the time left to the horizon in which the devices are in service.
+            its lifetime minus the price of its first failure, if the layout's traffic has prices; for fleets, the last slot
+            counts up to the first failure in it. With ``end = "horizon"`` it is the share of the time left to the horizon in
+            which the devices are in service.
         behind_low, behind_high: 95 % confidence interval of that difference over the futures.
         service: with ``end = "horizon"``, that share, mean over the futures; else ``None``.
     """
@@ -168,10 +169,11 @@ def _seconds_left(params: Params, state: State) -> float:
 
 def _values(params: Params, layout: Layout, state: State, episodes: Episode) -> Float[np.ndarray, "C S"]:
     """Return the value of each future of each candidate; see :class:`Candidate`."""
+    value = np.asarray(values_of(params, layout, episodes), float)
     if params.end == "horizon":
-        return np.asarray(episodes.service_s, float) / _seconds_left(params, state)
+        return value / _seconds_left(params, state)
     price = np.asarray(layout.failure_price(state.elapsed))
-    return np.asarray(episodes.length, float) - np.asarray(episodes.first_failure) @ price
+    return value - np.asarray(episodes.first_failure) @ price
 
 
 @partial(jax.jit, static_argnames="policy")

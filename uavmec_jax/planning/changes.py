@@ -25,6 +25,7 @@ class WhatIf:
         change: one of :data:`CHANGES`.
         lifetime: slots with the change.
         gain: slots gained by the change; with ``end = "horizon"``, what it adds to ``service``.
+        at_least: whether a lifetime with the change reached ``max_slots``: it and the gain may be larger.
         service: with ``end = "horizon"``, the share of the time to the horizon in which the devices are in service with the
             change, else ``None``. A device that is removed does not count, nor does it in what its removal gains.
     """
@@ -33,6 +34,7 @@ class WhatIf:
     change: str
     lifetime: float
     gain: float
+    at_least: bool = False
     service: float | None = None
 
 
@@ -108,6 +110,7 @@ def rank_changes(params: Params, layout: Layout, episodes: Episode, seconds: flo
             change,
             lifetime=float(lived[number, device].mean()),
             gain=float(gains[number, device].mean()),
+            at_least=bool(lived[number, device].max() >= params.max_slots) and not goes_on,
             service=float(served[number, device].mean()) if goes_on else None,
         )
         for number, change in enumerate(CHANGES)

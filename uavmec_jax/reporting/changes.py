@@ -16,13 +16,13 @@ def change_table(changes: Sequence[WhatIf], names: Sequence[str]) -> Table:
     value, gain = ("in service", "gain, points") if of_service else ("lifetime", "gain")
     for column in ("rank", "device", "change", value, gain):
         table.add_column(column, justify="left" if column in ("device", "change") else "right")
-    for rank, row in enumerate(change_data(changes, names), 1):
-        label = device_label(row["device"], row["name"])
-        if of_service:
-            numbers = (f"{row['service']:.1%}", f"{100 * row['gain']:+.1f}")
+    for rank, change in enumerate(changes, 1):
+        if change.service is None:
+            more = "≥ " * change.at_least
+            numbers = (f"{more}{change.lifetime:.2f}", f"{more}{change.gain:+.2f}")
         else:
-            numbers = (f"{row['lifetime']:.2f}", f"{row['gain']:+.2f}")
-        table.add_row(str(rank), label, row["change"], *numbers)
+            numbers = (f"{change.service:.1%}", f"{100 * change.gain:+.1f}")
+        table.add_row(str(rank), device_label(change.device + 1, names[change.device]), change.change, *numbers)
     return table
 
 

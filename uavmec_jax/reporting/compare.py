@@ -7,8 +7,8 @@ import pandas as pd
 from rich.table import Table
 from rich.text import Text
 
-from uavmec_jax.reporting.formatting import axis_values, first_to_fail, half_interval
-from uavmec_jax.studies.compare import Side, differences, overall, pair
+from uavmec_jax.reporting.formatting import axis_values, cell_name, censored_share, first_to_fail, half_interval
+from uavmec_jax.studies.compare import Side, differences, mostly_censored, overall, pair
 
 _MEASURES = {
     "difference": "mean paired difference B - A, slots",
@@ -26,9 +26,15 @@ def comparison(a: Side, b: Side) -> tuple[dict[str, Table], dict[str, Any]]:
     """
     pairs, axes = pair(a, b)
     cells, measures = differences(pairs, axes), overall(pairs, axes)
+    left_out = mostly_censored(pairs, axes)
+    names = [cell_name(cell, axes) for _, cell in pairs[left_out].drop_duplicates(axes).iterrows()]
+    over = f"Over all {len(cells)} cells, {len(pairs)} pairs"
+    if names:
+        kept = f"{len(cells) - len(names)} of {len(cells)} cells, {(~left_out).sum()} pairs"
+        over = f"Over {kept}; half or more of the episodes are censored (reach max_slots) in {'; '.join(names)}"
     tables = {
         f"Lifetime in slots, seed by seed. A: {a.name}; B: {b.name}": _cell_table(cells, axes),
-        f"Over all {len(cells)} cells, {len(pairs)} pairs": _measure_table(measures),
+        over: _measure_table(measures),
     }
     data = {
         "a": a.name,
@@ -38,7 +44,7 @@ def comparison(a: Side, b: Side) -> tuple[dict[str, Table], dict[str, Any]]:
         "overall": {
             name: dict(zip(("value", "low", "high"), values, strict=True)) for name, values in measures.items()
         },
-    }
+    } | ({"left_out": names} if names else {})
     return tables, data
 
 
@@ -50,7 +56,9 @@ def _cell_table(cells: pd.DataFrame, axes: list[str]) -> Table:
         style = "green" if cell["low"] > 0 else "red" if cell["high"] < 0 else "default"
         difference = Text(f"{cell['difference']:+.2f}", style=style)
         difference.append(half_interval(cell["low"], cell["high"]), style="dim")
-        table.add_row(*axis_values(cell, (*axes, "seeds")), f"{cell['a']:.2f}", f"{cell['b']:.2f}", difference)
+        shares = [cell.get(f"censored_{side}", 0.0) for side in "ab"]
+        means = [f"{cell[side]:.2f}{censored_share(share)}" for side, share in zip("ab", shares, strict=True)]
+        table.add_row(*axis_values(cell, (*axes, "seeds")), *means, difference)
     return table
 
 

@@ -145,9 +145,9 @@ def fleet_next_lines(advice: Advice, scenario: NamedScenario) -> list[str]:
 def _return(uav: UavAdvice, action: str) -> str:
     if action in ("swap", "charge", "wait", "grounded"):
         return ""
+    if uav.returns_in == 0:
+        return ""
     if math.isnan(uav.returns_in):
         return "; it need not return to a depot"
-    if uav.returns_in == 0:
-        return "; it is at the depot"
     slots = f"{uav.returns_in:g} slot{'s' * (uav.returns_in != 1)}"
     return f"; it returns to a depot in {duration(uav.returns_in_s)} ({slots})"

@@ -22,7 +22,7 @@ from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import MAX_DEVICES, Params
 from uavmec_jax.files.validation import suggest
 from uavmec_jax.scenarios.region import Positions
-from uavmec_jax.scenarios.schema import DepotTable, Device, ScenarioFile, label
+from uavmec_jax.scenarios.schema import DepotSettings, Device, ScenarioFile, label
 
 UNLISTED = -1
 """``device_type`` and ``task`` of hardware that the paper's tables do not list."""
@@ -49,7 +49,7 @@ def check_inventory(file: ScenarioFile) -> None:
     check_depots(file.depot)
 
 
-def check_depots(tables: Sequence[DepotTable]) -> None:
+def check_depots(tables: Sequence[DepotSettings]) -> None:
     """Check that depots have only the settings of their kind.
 
     Raises:
@@ -101,7 +101,7 @@ def build_layout(file: ScenarioFile, params: Params, positions: Positions) -> La
     )
 
 
-def depots_of(tables: Sequence[DepotTable], position: Float[np.ndarray, "D 2"]) -> Depots | None:
+def depots_of(tables: Sequence[DepotSettings], position: Float[np.ndarray, "D 2"]) -> Depots | None:
     """Return the depots of the tables at the given positions, m; ``None`` without tables."""
     if not tables:
         return None

@@ -27,10 +27,15 @@ _CountFromOne = Annotated[float, Field(ge=1, allow_inf_nan=True), AfterValidator
 _Kind: Any = Literal[tuple(kind.name.lower() for kind in DepotKind)]
 
 
-class Located(StrictModel):
-    """Something with a name and a position, which is either ``x_m, y_m`` or ``lon, lat``. Units are in the names."""
+class Named(StrictModel):
+    """Something that may have a name."""
 
     name: _Name | None = None
+
+
+class Located(Named):
+    """Something with a name and a position, which is either ``x_m, y_m`` or ``lon, lat``. Units are in the names."""
+
     x_m: float | None = None
     y_m: float | None = None
     lon: _Longitude | None = None
@@ -55,8 +60,8 @@ class Device(Located):
     """Weight in measures of service; 1 if it is left out."""
 
 
-class DepotTable(Located):
-    """One depot, by default ``depot 1``, ``depot 2``, ...; what is missing is as in :func:`make_depots`."""
+class DepotSettings(Named):
+    """What one depot does; what is missing is as in :func:`make_depots`."""
 
     kind: _Kind = "swap"
     pads: _CountFromOne | None = None
@@ -64,6 +69,10 @@ class DepotTable(Located):
     """Full batteries in stock; only of a depot that swaps."""
     power_w: _Power | None = None
     """Power per UAV; only of a depot that charges."""
+
+
+class DepotTable(DepotSettings, Located):
+    """One depot, by default ``depot 1``, ``depot 2``, ..."""
 
 
 class Uav(Located):
