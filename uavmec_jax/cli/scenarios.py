@@ -94,7 +94,8 @@ def evaluate(
         print_json(head | about | {"policies": rows})
         return
     console = Console()
-    console.print(f"[bold]Lifetime over {draws} volume draws ± 95 %[/bold]")
+    measured = "Share of the horizon in service" if "service" in rows[0] else "Lifetime"
+    console.print(f"[bold]{measured} over {draws} volume draws ± 95 %[/bold]")
     console.print(evaluation_table(rows))
     if trained is not None:
         for line in _training_lines(trained, named, scenario):
@@ -106,6 +107,7 @@ def _training_lines(trained: Any, named: Any, scenario: ScenarioChoice) -> list[
     axes = ", ".join(f"{name} {value}" for name, value in trained.trained_on.items())
     lines = [f"Trained by {trained.algorithm.upper()} on {axes}."]
     lines += [f"Out of distribution: {line}." for line in trained.out_of_distribution(named.params, named.layout)]
+    lines += [f"{line[0].upper()}{line[1:]}." for line in trained.lifted_to(named.layout)]
     here = scenario.axes
     elsewhere = (
         scenario.file is not None

@@ -215,7 +215,7 @@ def plan_data(plan: Plan, scenario: NamedScenario) -> dict[str, Any]:
 
 
 def _lifetime_data(plan: Plan) -> dict[str, Any]:
-    """Return mean lifetimes and bound; for fleets, also the share of the draws in which a policy reaches the limit."""
+    """Return mean lifetimes and bound; for fleets, also the share of the draws in which they reach ``max_slots``."""
     assert plan.bound is not None
     data: dict[str, Any] = {
         "policies": {name: float(lifetimes.mean()) for name, lifetimes in plan.lifetimes.items()},
@@ -224,7 +224,7 @@ def _lifetime_data(plan: Plan) -> dict[str, Any]:
     if not plan.as_in_paper:
         limit = int(plan.params.max_slots)
         reached = {name: float((lifetimes >= limit).mean()) for name, lifetimes in plan.lifetimes.items()}
-        data["at_limit"] = reached | {"bound": float((plan.bound >= limit).mean())}
+        data["censored"] = reached | {"bound": float((plan.bound >= limit).mean())}
     return data
 
 
