@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Num
 
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
@@ -119,7 +119,7 @@ def rank_changes(params: Params, layout: Layout, episodes: Episode, seconds: flo
     return tuple(sorted(effects, key=lambda effect: (-effect.gain, CHANGES.index(effect.change), effect.device)))
 
 
-def _by_change(values: Float[np.ndarray, "changes D"], n: int) -> Float[np.ndarray, "3 n D"]:
+def _by_change(values: Num[np.ndarray, "changes D"], n: int) -> Float[np.ndarray, "3 n D"]:
     return np.asarray(values, float).reshape(len(CHANGES), n, -1)
 
 

@@ -79,7 +79,8 @@ def _uav_row(
 def fleet_table(rows: Sequence[dict[str, Any]], scenario: NamedScenario) -> Table:
     """Return a table of the slots of a tour; slots in which no UAV flies and nothing else changes share a row.
 
-    Places have their numbers: ``#1`` for a device, ``D1`` for a depot.
+    Places have their numbers: ``#1`` for a device, ``D1`` for a depot. Behind them is the energy that is left, in kJ. Devices
+    whose battery is empty are in a column of their own, if there are any.
 
     Args:
         rows: from :func:`fleet_rows`.
@@ -92,8 +93,8 @@ def fleet_table(rows: Sequence[dict[str, Any]], scenario: NamedScenario) -> Tabl
     for name in uavs:
         table.add_column(f"{name}\nat, kJ", no_wrap=True)
     any_out = any(row["out_of_power"] for row in rows)
-    for column in ("served", "lowest\nbattery", "oldest\ndata", *["out of\npower"] * any_out):
-        lists = column in ("served", "out of\npower")
+    for column in ("served", "lowest\nbattery", "oldest\ndata", *["empty"] * any_out):
+        lists = column in ("served", "empty")
         table.add_column(column, justify="left" if lists else "right", no_wrap=not lists)
     for group in _groups(rows):
         first, last = group[0], group[-1]
@@ -146,7 +147,8 @@ def _uav_cell(scenario: NamedScenario, uav: dict[str, Any]) -> str:
     if uav["at_depot"] is None:
         return f"#{uav['place']} {energy}"
     number = scenario.depot_names.index(uav["at_depot"]) + 1
-    return f"D{number} {uav['depot_service'] or 'waits'} {energy}"
+    service = f" {uav['depot_service']}" if uav["depot_service"] else ""
+    return f"D{number}{service} {energy}"
 
 
 def device_rows(params: Params, layout: Layout, tour: Trace) -> list[dict[str, Any]]:
