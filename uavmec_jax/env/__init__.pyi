@@ -4,6 +4,10 @@ from .dynamics import State as State
 from .dynamics import initial_state as initial_state
 from .dynamics import transition as transition
 from .environment import UavMecEnv as UavMecEnv
+from .fleet import Depots as Depots
+from .fleet import Fleet as Fleet
+from .fleet import make_depots as make_depots
+from .fleet import make_fleet as make_fleet
 from .generator import ScenarioDistribution as ScenarioDistribution
 from .generator import sample_scenario as sample_scenario
 from .hardware import DEVICE_TYPES as DEVICE_TYPES

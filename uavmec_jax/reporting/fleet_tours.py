@@ -79,8 +79,8 @@ def _uav_row(
 def fleet_table(rows: Sequence[dict[str, Any]], scenario: NamedScenario) -> Table:
     """Return a table of the slots of a tour; slots in which no UAV flies and nothing else changes share a row.
 
-    Places have their numbers: ``#1`` for a device, ``D1`` for a depot. Behind them is the energy that is left, in kJ. Devices
-    whose battery is empty are in a column of their own, if there are any.
+    Places have their numbers: ``#1`` for a device, ``D1`` for a depot. Behind them is the energy that is left, in kJ; after a
+    swap the battery is full. Devices whose battery is empty are in a column of their own, if there are any.
 
     Args:
         rows: from :func:`fleet_rows`.
@@ -143,12 +143,13 @@ def _uav_cell(scenario: NamedScenario, uav: dict[str, Any]) -> str:
     """Say where a UAV is, what the depot did for it, and its energy after the slot."""
     energy = f"{uav['energy_j'] / 1e3:.0f}"
     if uav["grounded"]:
-        return f"grounded {energy}"
+        return "grounded"
     if uav["at_depot"] is None:
         return f"#{uav['place']} {energy}"
-    number = scenario.depot_names.index(uav["at_depot"]) + 1
-    service = f" {uav['depot_service']}" if uav["depot_service"] else ""
-    return f"D{number}{service} {energy}"
+    depot = f"D{scenario.depot_names.index(uav['at_depot']) + 1}"
+    if uav["depot_service"] == "swap":
+        return f"{depot} swap"
+    return f"{depot} charge {energy}" if uav["depot_service"] else f"{depot} {energy}"
 
 
 def device_rows(params: Params, layout: Layout, tour: Trace) -> list[dict[str, Any]]:
