@@ -14,12 +14,16 @@ _MAX_DRAWS = 10_000
 @click.command()
 @scenario_options(argument=True)
 @click.option("--draws", type=int, default=8, help="Number of volume draws to evaluate lifetimes on (default: 8).")
-@click.option("--width", type=int, default=256, help="Width of the beam: the number of states it keeps (default: 256).")
+@click.option(
+    "--width",
+    type=int,
+    help="Width of the beam: the number of states it keeps (default: 256; with several UAVs or depots, 64).",
+)
 @out_option(help="Folder of the tour (default: runs/plan-<time>).")
 @json_option
-def plan(scenario: ScenarioChoice, draws: int, width: int, out: Path | None, as_json: bool) -> None:
+def plan(scenario: ScenarioChoice, draws: int, width: int | None, out: Path | None, as_json: bool) -> None:
     """Plan tours for SCENARIO, a file (TOML or CSV), or for a random scenario; bound, first failure, repairs."""
-    if not 1 <= width <= 100_000:
+    if width is not None and not 1 <= width <= 100_000:
         raise InputError(f"--width is {width}; give 1 to 100000 states")
     _check_draws(draws)
     from uavmec_jax.training import host

@@ -14,6 +14,7 @@ from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.measures import ServiceMeasures, measure
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Episode, Trace, tour_policy, trace
+from uavmec_jax.planning import beam
 from uavmec_jax.planning.changes import WhatIf, layouts_to_try, rank_changes
 from uavmec_jax.planning.fleet_deadlines import earliest_deadline
 from uavmec_jax.planning.fleet_demand import horizon, is_alone
@@ -31,7 +32,7 @@ from uavmec_jax.planning.rollout_planner import SAMPLES
 from uavmec_jax.planning.service_bound import service_bound
 
 WIDTH = 256
-"""States that the beam keeps: one scenario can afford more than a study (:data:`uavmec_jax.planning.beam.WIDTH`)."""
+"""States that the beam keeps for one UAV without depots: one scenario can afford more than a study (:data:`beam.WIDTH`)."""
 
 PLANNED_SLOTS = 64
 """Slots to plan for by default where depots let UAVs fly on for ever: ten hours or so."""
@@ -79,7 +80,7 @@ class Plan:
 
 
 def make_plan(
-    params: Params, layout: Layout, draws: Key[Array, " D"], *, width: int = WIDTH, samples: int = SAMPLES
+    params: Params, layout: Layout, draws: Key[Array, " D"], *, width: int | None = None, samples: int = SAMPLES
 ) -> Plan:
     """Plan for one scenario.
 
@@ -90,9 +91,10 @@ def make_plan(
         params: scenario parameters.
         layout: the devices, the UAVs and the depots.
         draws: volume draws; policies are evaluated on all of them, the tours are those of the first.
-        width: states that the beam keeps.
+        width: states that the beam keeps; by default :data:`WIDTH`, for fleets as many as in studies.
         samples: futures that the rollout planner simulates per candidate.
     """
+    width = (WIDTH if is_alone(layout) else beam.WIDTH) if width is None else width
     count, goes_on = draws.shape[0], params.end == "horizon"
     per_draw, unchanged = _repeat(params, count), _repeat(layout, count)
     if plans_changes := is_alone(layout) and not goes_on:

@@ -99,8 +99,8 @@ def fleet_next_table(advice: Advice, scenario: NamedScenario) -> Table:
     """Return a table of where each UAV goes next, with the runners-up."""
     table = Table()
     of_service = advice.uavs[0].candidates[0].service is not None
-    value, behind = ("in service", "behind, points") if of_service else ("lifetime", "behind the first")
-    for column in ("UAV", "rank", "next", value, behind, ""):
+    value, behind = ("in service", "behind,\npoints") if of_service else ("lifetime", "behind\nthe first")
+    for column in ("UAV", "rank", "next", value, behind, "policy's\nchoice"):
         table.add_column(column, justify="right" if column in ("rank", value, behind) else "left")
     actions = next_actions(advice, scenario)
     for name, uav, action in list(zip(scenario.uav_names, advice.uavs, actions, strict=True))[:_MAX_UAVS]:
@@ -110,7 +110,7 @@ def fleet_next_table(advice: Advice, scenario: NamedScenario) -> Table:
                 str(rank),
                 _do(scenario, candidate.device, action if rank == 1 else None),
                 *_numbers(candidate, rank),
-                "the policy's choice" if candidate.device == uav.policy_choice else "",
+                "yes" if candidate.device == uav.policy_choice else "",
                 end_section=rank == min(_RANKS, len(uav.candidates)),
             )
             if action == "grounded":
