@@ -26,7 +26,7 @@ def ratio_figure(table: pd.DataFrame, path: Path) -> None:
     cells = table.groupby(["powered", "connected"], sort=False)[[*names, "bound"]].mean().reset_index()
     ratios = cells.assign(**{name: 100 * cells[name] / cells["bound"] for name in names})
     panels = [(name, f"{display_name(name)}: {ratios[name].mean():.1f} %") for name in names]
-    save(heat_map_figure(ratios, panels, (70.0, 100.0), "lifetime, % of the upper bound"), path)
+    save(heat_map_figure([(ratios, panels)], (70.0, 100.0), "lifetime, % of the upper bound"), path)
 
 
 def reliability_figure(bins: pd.DataFrame, path: Path) -> None:

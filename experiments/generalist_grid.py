@@ -90,7 +90,7 @@ def play(planned: Results, policy: Policy, count: int) -> tuple[pd.DataFrame, di
     batches = []
     for params, layouts, batch_keys in scenario_batches(planned, keys):
         episodes = policy_episodes(policy, params, layouts, batch_keys)
-        batches.append({name: np.asarray(leaf) for name, leaf in vars(episodes).items()})
+        batches.append({name: np.asarray(leaf) for name, leaf in vars(episodes).items() if leaf is not None})
     episodes = {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
     table = planned.agents.loc[: count - 1, ["seed", "powered", "connected"]].copy()
     for name in _LADDER:

@@ -7,6 +7,7 @@ import pytest
 
 from tests.populations import make_agent, over_agents, stack
 from uavmec_jax.agents import a2c, dqn, ppo
+from uavmec_jax.env.params import Params
 from uavmec_jax.env.rewards import make_reward
 
 ALGORITHMS = {
@@ -37,3 +38,23 @@ def test_update_is_traced_once(name):
     state = update(agents, init(agents), np.int32(0), np.int32(2))
     update(agents, state, np.int32(2), np.int32(5))
     update(others, init(others), np.int32(0), np.int32(2))
+
+
+def test_dqn_takes_as_many_devices_as_its_replay_can_tell_apart():
+    assert dqn.algorithm(dqn.DQNSpec(n_devices=256)).name == "dqn"
+    with pytest.raises(
+        ValueError, match=r"^n_devices is 257; a DQN replay holds at most 256 devices; take ppo or a2c$"
+    ):
+        dqn.algorithm(dqn.DQNSpec(n_devices=257))
+
+
+@pytest.mark.parametrize(
+    ("make", "spec", "hyper_class"),
+    [(a2c.algorithm, a2c.A2CSpec, a2c.A2CHyper), (ppo.algorithm, ppo.PPOSpec, ppo.PPOHyper)],
+)
+def test_ppo_and_a2c_take_more(make, spec, hyper_class):
+    algorithm = make(spec(total_steps=100, hidden=(4,), n_devices=300))
+    agents = stack([make_agent(params=Params(n_devices=300), hyper_class=hyper_class)])
+    state = jax.eval_shape(over_agents(algorithm.init, 0), agents)
+    after = jax.eval_shape(over_agents(algorithm.update, 0, 0, None, None), agents, state, np.int32(0), np.int32(1))
+    chex.assert_trees_all_equal_shapes(after, state)

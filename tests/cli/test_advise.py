@@ -94,6 +94,8 @@ def test_a_scenario_out_of_distribution_is_advised_on_with_a_warning(tmp_path):
         (("--policy", "generalst"), "did you mean 'generalist'?"),
         (("--price", 3), "price is given, but the traffic of these devices is unknown"),
         (("--powered", 3), "leave out --powered"),
+        (("--uavs", 2), "a scenario file says which UAVs and depots there are; leave out --uavs, --depot"),
+        (("--depot", "swap"), "leave out --uavs, --depot"),
         (("--state", "nowhere.json"), "nowhere.json"),
     ],
 )

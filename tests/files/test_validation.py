@@ -35,6 +35,7 @@ class Car(StrictModel):
     spare_engine: Engine | None = None
     origin: Annotated[tuple[float, Annotated[float, Field(le=90)]] | None, from_array] = None
     seat: Annotated[tuple[Seat, ...], from_array] = ()
+    doors: dict[str, Seat] = Field(default_factory=dict)
 
     @pydantic.model_validator(mode="after")
     def _check_seats(self):
@@ -52,7 +53,7 @@ ERRORS = {
     "key": ({"wheels": 4, "engin": {}}, "car.toml: engin is not a setting; did you mean 'engine'?"),
     "unlike key": (
         {"wheels": 4, "q": 1},
-        "car.toml: q is not a setting; known: wheels, mirrors, engine, spare_engine, origin, seat",
+        "car.toml: q is not a setting; known: wheels, mirrors, engine, spare_engine, origin, seat, doors",
     ),
     "nested key": (
         {"wheels": 4, "engine": {"powr_w": 1.0}},
@@ -81,6 +82,14 @@ ERRORS = {
     "key in a list of tables": (
         {"wheels": 4, "seat": [{"name": "left", "width": 1.0}]},
         "car.toml: seat 1 (left): width is not a setting; did you mean 'width_m'? known: name, width_m",
+    ),
+    "value in a table by name": (
+        {"wheels": 4, "doors": {"left": {"name": "a", "width_m": 3.0}}},
+        "car.toml: doors.left.width_m is 3.0; it should be less than or equal to 2",
+    ),
+    "key in a table by name": (
+        {"wheels": 4, "doors": {"left": {"name": "a", "width": 3.0}}},
+        "car.toml: doors.left.width is not a setting; did you mean 'width_m'? known: name, width_m",
     ),
     "no table in a list of tables": ({"wheels": 4, "seat": [3]}, "car.toml: seat 1 (3): is 3; it should be"),
     "validator": ({"wheels": 4, "seat": [{"name": "a"}] * 4}, "car.toml: holds more than 3 seats"),

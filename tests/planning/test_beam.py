@@ -10,7 +10,8 @@ from uavmec_jax.env.dynamics import initial_state
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import rollout, tour_policy, volume_table
 from uavmec_jax.planning import demand
-from uavmec_jax.planning.beam import _dominated, beam_search
+from uavmec_jax.planning.beam import beam_search
+from uavmec_jax.planning.beam_score import dominated
 from uavmec_jax.scenarios.seeds import layout_for_seed
 
 search = jax.jit(beam_search, static_argnums=3)
@@ -66,11 +67,11 @@ def test_dominance():
         uav_energy=states.uav_energy.at[3, 0].add(1.0),  # more energy than 0, but at another hover point
     )
     hover_point, alive = jnp.array([5, 5, 5, 6, 5]), jnp.ones(5, bool)
-    assert _dominated(layout, states, hover_point, alive).tolist() == [False, True, True, False, True]  # 4 is 0 again
-    without_0 = _dominated(layout, states, hover_point, alive.at[0].set(False))
+    assert dominated(layout, states, hover_point, alive).tolist() == [False, True, True, False, True]  # 4 is 0 again
+    without_0 = dominated(layout, states, hover_point, alive.at[0].set(False))
     assert without_0[1:].tolist() == [True, True, False, False]  # 4 takes its place
     carefree = layout.replace(has_comms=jnp.ones(12, bool), has_power=jnp.ones(12, bool))
-    assert _dominated(carefree, states, hover_point, alive).tolist() == [False, True, True, False, True]
+    assert dominated(carefree, states, hover_point, alive).tolist() == [False, True, True, False, True]
 
 
 def test_visit_shares_of_a_hover_point_sum_to_at_most_one():

@@ -18,8 +18,8 @@ from uavmec_jax.planning.bound import upper_bound
 from uavmec_jax.planning.fleet_demand import horizon
 from uavmec_jax.planning.flight import Rounds
 from uavmec_jax.planning.heuristics import HEURISTICS
-from uavmec_jax.planning.parallel import beam_episodes, bound_scenarios, heuristic_episodes, rollout_planner_episodes
 from uavmec_jax.planning.hover_sets import ListedHoverSets
+from uavmec_jax.planning.parallel import beam_episodes, bound_scenarios, heuristic_episodes, rollout_planner_episodes
 from uavmec_jax.planning.refutation import Refuter
 from uavmec_jax.planning.requirements import Features, Rows
 from uavmec_jax.planning.rollout_planner import rollout_planner

@@ -11,6 +11,7 @@ from numpy.testing import assert_array_equal
 
 from uavmec_jax.errors import PolicyError, StudyError
 from uavmec_jax.reporting import canvas, figures, tables
+from uavmec_jax.reporting.summary import summary
 from uavmec_jax.runs.results_folder import check_directory, load_results
 from uavmec_jax.runs.run import resume_run, run_study
 from uavmec_jax.runs.run_plan import BYTES_WITHOUT_TRAINING, plan_run
@@ -116,7 +117,7 @@ def test_tables_and_figures(finished, tmp_path):
     assert any(
         "best weights to rollout planner; rollout planner to clairvoyant beam; clair" in title for title in shown
     )
-    lines = tables.summary(results)
+    lines = summary(results)
     assert "Mean over 4 cells" in lines[0]
     assert "On the planners' draws (2 per layout): best weights" in lines[1]
     for figure in (figures.run_figure(results), figures.curves_figure(results), figures.ladder_figure(results)):
@@ -131,7 +132,7 @@ def test_other_axes_make_a_list():
     assert len(results.cells()) == 4
     (table,) = tables.tables(results).values()
     assert table.row_count == 4
-    assert tables.summary(results)
+    assert summary(results)
     assert figures.run_figure(results)
 
 
@@ -176,7 +177,7 @@ def test_a_study_that_trains_nothing(tmp_path):
     again = load_results(tmp_path / "none")
     assert_array_equal(again.evaluation["bound/lifetime"], results.evaluation["bound/lifetime"])
     assert len(tables.tables(again)) == 3
-    assert "upper bound" in tables.summary(again)[1]
+    assert "upper bound" in summary(again)[1]
     assert figures.run_figure(again)
 
 

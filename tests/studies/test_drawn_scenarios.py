@@ -172,10 +172,10 @@ def test_quantities_outside_the_training_distribution_are_named():
     params = Params()
     layout = sample_layout(jax.random.key(0), params, 8, 8)
     assert out_of_distribution(scenarios, trained, params, layout) == []
-    far = Params(n_devices=40, data_age_limit_slots=20, uav_speed_m_s=9.0, region_m=(9000.0, 9000.0))
+    far = Params(n_devices=40, data_age_limit_slots=20, uav_speed_m_s=9.0, region_m=(9000.0, 9000.0), end="horizon")
     lines = out_of_distribution(scenarios, trained, far, sample_layout(jax.random.key(0), far, 8, 8))
     quantities = [line.split(":")[0] for line in lines]
-    assert quantities == ["devices", "extent in m", "the UAV's speed in m/s", "data_age_limit_slots"]
+    assert quantities == ["devices", "extent in m", "the UAV's speed in m/s", "end", "data_age_limit_slots"]
     assert lines[0] == "devices: 40; it was trained on 4 to 16"
     assert lines[-1] == "data_age_limit_slots: 20; it was trained on 10"
 

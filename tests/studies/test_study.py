@@ -9,13 +9,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 from uavmec_jax.env.rewards import REWARDS
 from uavmec_jax.errors import StudyError
 from uavmec_jax.studies.paper import TABLE6
+from uavmec_jax.studies.parts import split_study
 from uavmec_jax.studies.population import (
     evaluation_keys,
     make_agent_ids,
     make_agents,
     make_algorithm,
     n_agents,
-    split_by_algorithm,
     validation_keys,
 )
 from uavmec_jax.studies.study import load_study, parse_study, shipped_studies, study_toml
@@ -34,7 +34,7 @@ def test_shipped_studies_are_valid_and_round_trip(name):
     study = load_study(name)
     assert study.name == name
     assert parse_study(study_toml(study), "again") == study
-    sizes = {"planning": 2500, "table6": 675, "table7": 240, "table7-ppo": 120, "generalist": 2}
+    sizes = {"fleet": 7500, "planning": 2500, "table6": 675, "table7": 240, "table7-ppo": 120, "generalist": 2}
     assert n_agents(study) == len(make_agent_ids(study)) == sizes.get(name, 250)
 
 
@@ -112,7 +112,7 @@ BAD = [
         {"params.uav_flying_power_w": -150.0},
         "bad.toml: params.uav_flying_power_w is -150.0; it should be greater than or",
     ),
-    ({"params.n_devices": 65}, "bad.toml: params.n_devices is 65; it should be less than or equal to 64"),
+    ({"params.n_devices": 1001}, "bad.toml: params.n_devices is 1001; it should be less than or equal to 1000"),
     (
         {"params.device_battery_range_j": [8e4, 5e4]},
         "bad.toml: params.device_battery_range_j is [80000.0, 50000.0]; give",
@@ -227,7 +227,8 @@ def test_a_study_of_several_algorithms_is_split_by_algorithm():
     study = parse_study(CELLS, "x", {"axes.algorithm": ["a2c", "dqn"], "axes.gamma": [0.9, 0.98], "a2c.vf_coef": 0.3})
     assert n_agents(study) == len(make_agent_ids(study)) == 16
     assert [agent_id["algorithm"] for agent_id in make_agent_ids(study)] == ["a2c"] * 8 + ["dqn"] * 8
-    a2c, dqn = split_by_algorithm(study)
+    a2c, dqn = (part.study for part in split_study(study))
+    assert [part.name for part in split_study(study)] == ["a2c", "dqn"]
     assert (make_algorithm(a2c).name, make_algorithm(dqn).name) == ("a2c", "dqn")
     agents, others = make_agents(a2c), make_agents(dqn)
     assert_array_equal(agents.hyper.gamma, np.tile(np.float32([0.9, 0.98]), 4))

@@ -138,7 +138,15 @@ class DQNState:
 
 
 def algorithm(spec: DQNSpec) -> Algorithm:
-    """Return the algorithm with its static settings bound."""
+    """Return the algorithm with its static settings bound.
+
+    Raises:
+        ValueError: there are more devices than the replay buffer can tell apart.
+    """
+    if spec.n_devices > replay.MAX_ACTIONS:
+        raise ValueError(
+            f"n_devices is {spec.n_devices}; a DQN replay holds at most {replay.MAX_ACTIONS} devices; take ppo or a2c"
+        )
     return Algorithm(
         name="dqn",
         iterations=spec.iterations,

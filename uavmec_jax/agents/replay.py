@@ -19,6 +19,8 @@ from jaxtyping import Array, Bool, Float, Int, UInt
 from uavmec_jax.env.types import Scalar
 
 _ACTION_BITS = 8
+MAX_ACTIONS = 1 << _ACTION_BITS
+"""Largest number of actions that a row can tell apart."""
 _TERMINATED = 1 << _ACTION_BITS
 _ENDED = 2 << _ACTION_BITS
 
@@ -48,7 +50,7 @@ class ReplaySpec:
     """Shape of one agent's replay buffer (static).
 
     Attributes:
-        n_devices: number of devices, at most 256.
+        n_devices: number of devices, at most :data:`MAX_ACTIONS`.
         capacity: number of transitions that can be sampled.
         stride: number of transitions written at a time; the ring is a multiple of it, so no single write wraps around.
         max_age: largest age that can occur, slots.

@@ -57,7 +57,8 @@ def print_json(data: Any) -> None:
 
 def print_results(results: Any, directory: Path, console: Any, as_json: bool) -> None:
     """Print the tables of a run; as JSON, its label and its cells."""
-    from uavmec_jax.reporting.tables import summary, tables
+    from uavmec_jax.reporting.summary import summary
+    from uavmec_jax.reporting.tables import tables
     from uavmec_jax.studies.first_failures import place_frames
 
     if as_json:

@@ -26,18 +26,20 @@ class ScenarioChoice:
     Attributes:
         file: a scenario file, or ``None`` for a random scenario.
         axes: the random scenario on the axes of studies: ``powered``, ``connected``, ``seed`` and perhaps ``place``.
+        fleet: what the random scenario has besides its devices: perhaps ``uavs`` and ``depot``.
         settings: scenario parameters to change, by name.
     """
 
     file: Path | None
     axes: dict[str, Any]
+    fleet: dict[str, Any]
     settings: dict[str, Any]
 
     def load(self, state: Path | None = None) -> Any:
         """Load the :class:`NamedScenario`, in the state of a file or in its initial state."""
         from uavmec_jax.scenarios.load import load_scenario
 
-        return load_scenario(self.file, state=state, settings=self.settings, **self.axes)
+        return load_scenario(self.file, state=state, settings=self.settings, **self.axes, **self.fleet)
 
 
 def scenario_options(*, argument: bool) -> Callable[[Callable], Callable]:
@@ -63,6 +65,10 @@ def scenario_options(*, argument: bool) -> Callable[[Callable], Callable]:
             "--connected", type=int, help="Number of devices with communication in a random scenario (default: 8)."
         ),
         click.option("--place", help="Evacuation whose devices a random scenario has (see uavmec traffic)."),
+        click.option("--uavs", type=int, help="Number of UAVs in a random scenario (default: 1)."),
+        click.option(
+            "--depot", metavar="KIND", help="Add a depot to a random scenario, at its corner: swap or charge."
+        ),
         click.option("--seed", type=int, default=0, help="Seed of the random scenario and of the task volumes."),
         set_option(help="Change a parameter of Table 1, e.g. --set uav_battery_j=1e6."),
     )
@@ -70,15 +76,21 @@ def scenario_options(*, argument: bool) -> Callable[[Callable], Callable]:
     def decorate(command: Callable) -> Callable:
         @functools.wraps(command)
         def with_scenario(file: Path | None, settings: tuple[str, ...], seed: int, **others: Any) -> Any:
-            given = {name: others.pop(name) for name in ("powered", "connected", "place")}
-            given = {name: value for name, value in given.items() if value is not None}
+            given, fleet = (
+                {name: value for name in names if (value := others.pop(name)) is not None}
+                for names in (("powered", "connected", "place"), ("uavs", "depot"))
+            )
             if file is not None and given:
                 raise InputError(
                     f"{file}: a scenario file says which devices have power and communication, and where they are; leave "
                     "out --powered, --connected, --place"
                 )
+            if file is not None and fleet:
+                raise InputError(
+                    f"{file}: a scenario file says which UAVs and depots there are; leave out --uavs, --depot"
+                )
             axes = {"powered": _DEFAULT_COUNT, "connected": _DEFAULT_COUNT, "seed": seed} | given
-            return command(scenario=ScenarioChoice(file, axes, dict(map(assignment, settings))), **others)
+            return command(scenario=ScenarioChoice(file, axes, fleet, dict(map(assignment, settings))), **others)
 
         return _add_options(with_scenario, options)
 

@@ -26,7 +26,7 @@ def stands_at(depots: Depots, position: Float[Array, "K 2"]) -> Bool[Array, "K D
     return at & (jnp.cumsum(at, axis=1) == 1)
 
 
-def can_help(depots: Depots, packs: Float[Array, " D"]) -> Bool[Array, " D"]:
+def can_help(depots: Depots, packs: Float[Array, "*W D"]) -> Bool[Array, "*W D"]:
     """Return whether each depot has a pad, and a pack or power."""
     has_energy = jnp.where(depots.kind == DepotKind.SWAP, packs >= 1, depots.power_w > 0)
     return (depots.pads >= 1) & has_energy

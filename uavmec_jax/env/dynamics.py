@@ -75,6 +75,7 @@ class Outcome:
         duration: length of the slot, s; 0 if it never started.
         first_failure: each device's share in the first failure. Shares sum to 1 if a device failed: the battery that
             runs out earliest inside the slot has all of it; devices whose data expired share it equally.
+        lasted: share of the slot that was over when the first battery ran out, 1 if none did.
     """
 
     cause: Int[Array, "*batch"]
@@ -82,6 +83,7 @@ class Outcome:
     served: Bool[Array, "*batch n"]
     duration: Float[Array, "*batch"]
     first_failure: Float[Array, "*batch n"]
+    lasted: Scalar = 1.0
 
 
 def initial_state(params: Params, layout: Layout) -> State:
@@ -95,15 +97,17 @@ def initial_state(params: Params, layout: Layout) -> State:
         slot=jnp.zeros((), jnp.int32),
         elapsed=jnp.zeros((), jnp.float32),
     )
-    state = complete_state(layout, state)
-    return state if fleet.present is None else replace(state, grounded=~fleet.present)
+    return complete_state(layout, state)
 
 
 def complete_state(layout: Layout, state: State) -> State:
-    """Return a state with the fields that were left out: no UAV grounded, all devices alive, all packs in stock."""
+    """Return a state with the fields that were left out: no UAV grounded but padding, all devices alive, all packs there."""
     packs = jnp.zeros(0, jnp.float32) if layout.depots is None else jnp.asarray(layout.depots.packs, jnp.float32)
+    absent = jnp.zeros(layout.n_uavs, bool)
+    if layout.fleet is not None and layout.fleet.present is not None:
+        absent = ~layout.fleet.present
     defaults = {
-        "grounded": jnp.zeros(layout.n_uavs, bool),
+        "grounded": absent,
         "failed_at": jnp.full(layout.n_devices, -1, jnp.int32),
         "packs": packs,
     }
@@ -122,9 +126,9 @@ def in_service(params: Params, layout: Layout, state: State) -> Bool[Array, " n"
 
 def service(params: Params, layout: Layout, state: State) -> Float[Array, ""]:
     """Return the share of the devices that are :func:`in_service`, weighted by their priorities."""
-    weight = jnp.ones(layout.n_devices) if layout.priority is None else layout.priority
-    weight = weight if layout.present is None else jnp.where(layout.present, weight, 0.0)
-    return jnp.sum(jnp.where(in_service(params, layout, state), weight, 0.0)) / jnp.sum(weight)
+    weight = layout.service_weight()
+    total = jnp.sum(weight)
+    return jnp.sum(jnp.where(in_service(params, layout, state), weight, 0.0)) / jnp.where(total > 0, total, 1.0)
 
 
 def living_devices(params: Params, layout: Layout, state: State) -> Bool[Array, " n"] | None:
@@ -265,6 +269,7 @@ def _outcome(
         served=slot.served & happens,
         duration=jnp.where(happens, slot.duration, 0.0),
         first_failure=first / jnp.maximum(jnp.sum(first), 1),
+        lasted=jnp.minimum(jnp.min(lasts), 1.0),
     )
 
 

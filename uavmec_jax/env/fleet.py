@@ -75,7 +75,7 @@ UAV_FIELDS = ("speed_m_s", "flying_power_w", "hovering_power_w", "battery_j", "s
 """Fields of a :class:`Fleet` whose defaults are the parameters of the same name behind ``uav_``."""
 
 
-def make_fleet(params: Params, uavs: int, depots: Depots | None = None, **values: ArrayLike) -> Fleet:
+def make_fleet(params: Params, uavs: int, depots: Depots | None = None, **values: ArrayLike | Sequence) -> Fleet:
     """Return a fleet of ``uavs`` UAVs like that of the parameters, except for the given values.
 
     Args:
@@ -111,9 +111,9 @@ def make_fleet(params: Params, uavs: int, depots: Depots | None = None, **values
 def make_depots(
     position: Sequence[Sequence[float]] | Float[ArrayLike, "D 2"],
     kind: str | Sequence[str] = "swap",
-    pads: ArrayLike = math.inf,
-    packs: ArrayLike = math.inf,
-    power_w: ArrayLike = DEPOT_POWER_W,
+    pads: ArrayLike | Sequence[float] = math.inf,
+    packs: ArrayLike | Sequence[float] = math.inf,
+    power_w: ArrayLike | Sequence[float] = DEPOT_POWER_W,
 ) -> Depots:
     """Return depots; each argument but the positions is one value for all or one per depot.
 

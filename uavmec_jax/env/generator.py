@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int, Num, PRNGKeyArray
 
 from uavmec_jax.env import hardware
 from uavmec_jax.env.layout import Layout, Traffic, make_layout, mask_absent
-from uavmec_jax.env.params import Params
+from uavmec_jax.env.params import MAX_DEVICES, Params
 from uavmec_jax.env.rewards import Reward
 from uavmec_jax.env.scenario import Scenario
 from uavmec_jax.env.types import Range, Scalar
@@ -49,8 +49,8 @@ class ScenarioDistribution:
     params: Params
     reward: Reward
     typical: Scalar = struct.field(default=0.5, metadata={"ge": 0, "le": 1})
-    typical_devices: Scalar = struct.field(default=12, metadata={"ge": 2, "le": 64})
-    typical_least: Scalar = struct.field(default=4, metadata={"ge": 0, "le": 64})
+    typical_devices: Scalar = struct.field(default=12, metadata={"ge": 2, "le": MAX_DEVICES})
+    typical_least: Scalar = struct.field(default=4, metadata={"ge": 0, "le": MAX_DEVICES})
     devices: Range = (4, 16)
     powered: Range = (0.0, 1.0)
     connected: Range = (0.0, 1.0)

@@ -10,7 +10,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
-from uavmec_jax.env.dynamics import Outcome, State, living_devices, service
+from uavmec_jax.env.dynamics import Outcome, State, complete_state, living_devices, service
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.types import Scalar
@@ -208,10 +208,10 @@ def _largest_at_targets(
     living: Bool[Array, " n"] | None,
 ) -> Num[Array, ""]:
     """Return the largest value among the living devices that UAVs fly to, able to pay or not; 0 without any."""
+    n, target = layout.n_devices, jnp.clip(jnp.atleast_1d(action), 0, layout.n_places - 1)
     if layout.n_uavs == 1 and not layout.n_depots and living is None:
-        return value[jnp.reshape(jnp.asarray(action), ())]
-    n, target = layout.n_devices, jnp.reshape(jnp.asarray(action), (layout.n_uavs,))
-    counts = (target < n) & ~before.grounded
+        return value[target[0]]
+    counts = (target < n) & ~complete_state(layout, before).grounded
     device = jnp.clip(target, 0, n - 1)
     counts = counts if living is None else counts & living[device]
     return jnp.max(jnp.where(counts, value[device], 0))

@@ -13,6 +13,7 @@ from uavmec_jax.env.generator import ScenarioDistribution, scenario_from_draw
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.scenario import Scenario, advance, draw_volumes
+from uavmec_jax.env.types import Scalar
 
 Policy = Callable[..., Array]
 """``policy(params, layout, state, key=None) -> action``, an int32 place in ``[0, n + D)``, one per UAV (``[K]``) if there
@@ -31,14 +32,16 @@ class Episode:
         cause: why it ended, a :class:`Cause` as int32; ``NONE`` if the time limit ended it.
         failed: devices that failed in the last slot.
         first_failure: each device's share in the first failure; sums to 1 unless no device failed.
-        service_s: with ``end = "horizon"``, seconds in which the devices were in service (:func:`dynamics.service`), mean
-            over the devices weighted by their priorities; else ``None``.
+        lasted: share of the last slot that was over when the first battery ran out, 1 if none did.
+        service_s: with ``end = "horizon"``, seconds until the horizon in which the devices were in service
+            (:func:`dynamics.service`), mean over the devices weighted by their priorities; else ``None``.
     """
 
     length: Int[Array, "*batch"]
     cause: Int[Array, "*batch"]
     failed: Bool[Array, "*batch n"]
     first_failure: Float[Array, "*batch n"]
+    lasted: Scalar = 1.0
     service_s: Float[Array, "*batch"] | None = None
 
 
@@ -99,7 +102,8 @@ def _play(
         actions = progress.actions.at[state.slot].set(action, mode="drop") if slots else progress.actions
         if first_failure is not None and service_s is not None:
             first_failure = jnp.where(jnp.any(first_failure > 0), first_failure, outcome.first_failure)
-            service_s = service_s + outcome.duration * service(params, layout, after)
+            until_horizon = jnp.clip(params.horizon_s - state.elapsed, 0.0, outcome.duration)
+            service_s = service_s + until_horizon * service(params, layout, after)
         return _Progress(after, outcome, actions, first_failure, service_s)
 
     goes_on = params.end == "horizon"
@@ -119,6 +123,7 @@ def _play(
         cause=last.outcome.cause,
         failed=last.outcome.failed,
         first_failure=last.outcome.first_failure if last.first_failure is None else last.first_failure,
+        lasted=last.outcome.lasted,
         service_s=last.service_s,
     )
     return last.actions, episode
@@ -165,6 +170,7 @@ def _initial_outcome(n: int) -> Outcome:
         served=jnp.zeros(n, bool),
         duration=jnp.float32(0),
         first_failure=jnp.zeros(n, jnp.float32),
+        lasted=jnp.float32(1),
     )
 
 
@@ -213,6 +219,11 @@ class Trace:
 
 def trace(policy: Policy, params: Params, layout: Layout, key: PRNGKeyArray, slots: int) -> Trace:
     """Record the first ``slots`` slots of the episode that :func:`rollout` plays with the same key."""
+    return trace_from(policy, params, layout, initial_state(params, layout), key, slots)
+
+
+def trace_from(policy: Policy, params: Params, layout: Layout, state: State, key: PRNGKeyArray, slots: int) -> Trace:
+    """Record the next ``slots`` slots of the episode that :func:`rollout_from` plays with the same key."""
     play_slot = _make_play_slot(policy, params, layout, key)
 
     def play_if(carry: tuple[State, Outcome], _: None) -> tuple[tuple[State, Outcome], Trace]:
@@ -221,7 +232,7 @@ def trace(policy: Policy, params: Params, layout: Layout, key: PRNGKeyArray, slo
         state, outcome = jax.tree.map(lambda new, old: jnp.where(played, new, old), tuple(new), carry)
         return (state, outcome), Trace(played=played, action=action, state=state, outcome=outcome)
 
-    start = (initial_state(params, layout), _initial_outcome(layout.n_devices))
+    start = (complete_state(layout, state), _initial_outcome(layout.n_devices))
     return jax.lax.scan(play_if, start, None, length=slots)[1]
 
 

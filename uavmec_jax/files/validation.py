@@ -4,7 +4,7 @@ import dataclasses
 import difflib
 import math
 from collections.abc import Iterable, Sequence
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import pydantic
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, create_model
@@ -116,9 +116,12 @@ def _fields_at(model: Any, location: Sequence[Any]) -> dict[str, Any]:
     for part in location:
         if isinstance(part, int):  # all tables of a list have the same model
             continue
+        if get_origin(model) is dict:  # and so have all tables by name
+            model = get_args(model)[1]
+            continue
         fields = getattr(model, "model_fields", None)
         if fields is not None:
             model = fields[part].annotation if part in fields else None
-        arguments = get_args(model)  # of X | None or tuple[X, ...]
+        arguments = () if get_origin(model) is dict else get_args(model)  # of X | None or tuple[X, ...]
         model = next((argument for argument in arguments if hasattr(argument, "model_fields")), model)
     return dict(getattr(model, "model_fields", {}))

@@ -9,6 +9,8 @@ density of at most 5/6 (Kawamura 2024).
 therefore served in the slots that the ages can spare, and only as often as the longest feasible lifetime requires.
 """
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
@@ -64,7 +66,12 @@ def _deadlines(
 
 
 def feasible_horizon(
-    params: Params, layout: Layout, state: State, mean: SlotCosts, visit_share: Float[Array, " n"]
+    params: Params,
+    layout: Layout,
+    state: State,
+    mean: SlotCosts,
+    visit_share: Float[Array, " n"],
+    visits_in: Callable[[Float[Array, ""]], Float[Array, ""]] | None = None,
 ) -> tuple[Float[Array, ""], Float[Array, " n"]]:
     """Return the most slots into which all visits needed to survive them fit, and the services each battery then needs.
 
@@ -74,6 +81,8 @@ def feasible_horizon(
         state: before the slot.
         mean: the expected slot, from :func:`demand.mean_slot`.
         visit_share: share of a visit that each device accounts for, from :func:`demand.visit_shares`.
+        visits_in: the most visits that a fleet can make in a number of slots; by default those of the only UAV, one per
+            slot as long as its energy lasts.
 
     Returns:
         Slots, f32 in ``[1, LOOKAHEAD)``, and services ``[n]``, f32 whole numbers.
@@ -90,6 +99,8 @@ def feasible_horizon(
     def fits(slots: Float[Array, ""]) -> Bool[Array, ""]:
         age_visits, _ = demand.age_visits(params, layout, state.age, slots)
         visits = jnp.maximum(services(slots), age_visits)
+        if visits_in is not None:
+            return (visits @ visit_share <= visits_in(slots)) & jnp.all(visits <= slots)
         uav_lasts = slots * base * shortest <= state.uav_energy[0]
         return (visits @ visit_share <= slots) & jnp.all(visits <= slots) & uav_lasts
 

@@ -121,11 +121,15 @@ def mean_slot(params: Params, layout: Layout) -> SlotCosts:
 
     The mean work, ``E[min(v / rate, cap)]`` over uniform volumes ``v``, is exact; the duration is that of mean work.
     """
+    return jax.tree.map(lambda leaf: leaf[0], slot_costs(params, layout, mean_volumes(params, layout)[None]))
+
+
+def mean_volumes(params: Params, layout: Layout) -> Float[Array, " n"]:
+    """Return the volumes in bytes that each device gets done in a slot on average if it is not served."""
     low, high = (jnp.asarray(bound, jnp.float32) for bound in params.task_volume_range_bytes)
     fits = jnp.clip(params.slot_cap_s * layout.processing_rate, low, high)
     done = 0.5 * (fits**2 - low**2) + (high - fits) * fits
-    volumes = jnp.where(high > low, done / jnp.maximum(high - low, 1.0), low)
-    return jax.tree.map(lambda leaf: leaf[0], slot_costs(params, layout, volumes[None]))
+    return jnp.where(high > low, done / jnp.maximum(high - low, 1.0), low)
 
 
 def idle_drain(layout: Layout, costs: SlotCosts) -> Float[Array, "*H n"]:
@@ -204,16 +208,17 @@ def misses_deadline(
     visit_share: Float[Array, " n"],
     age: Int[Array, "*B n"],
     slots: Num[ArrayLike, ""],
+    servers: int | Int[Array, "*B 1"] = 1,
 ) -> Bool[Array, "*B"]:
     """Return whether the data that expire within ``slots`` more slots can no longer all be refreshed in time.
 
     This is the demand test of earliest-deadline scheduling: for every deadline, the visits due by then, counted in
-    :func:`visit_shares`, must fit into the slots until then.
+    :func:`visit_shares`, must fit into the slots until then, in each of which ``servers`` UAVs make one visit.
     """
     deadline = slots_to_expiry(params) - age
     counts = ~layout.has_comms & (deadline <= slots)
     load = load_by_deadline(jnp.where(counts, deadline, jnp.iinfo(jnp.int32).max), visit_share)
-    return jnp.any(counts & (load > deadline + _ROUNDING * 10), axis=-1)
+    return jnp.any(counts & (load > servers * deadline + _ROUNDING * 10), axis=-1)
 
 
 def load_by_deadline(deadline: Num[Array, "*B n"], visit_share: Float[Array, " n"]) -> Float[Array, "*B n"]:

@@ -11,9 +11,10 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Num
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
-from uavmec_jax.env.dynamics import initial_state
+from uavmec_jax.env.depots import can_help
+from uavmec_jax.env.dynamics import State, initial_state
 from uavmec_jax.env.fleet import Fleet
 from uavmec_jax.env.layout import Layout, fleet_of
 from uavmec_jax.env.params import Params
@@ -51,7 +52,7 @@ def longest(params: Params, layout: Layout) -> Int[Array, ""]:
     if not layout.n_depots:
         base, _ = demand.flight_power(params, fleet)
         slots = jnp.max(jnp.where(present_uavs(fleet), fleet.battery_j / jnp.maximum(base * shortest, 1e-3), 0.0)) + 2
-    if not _is_alone(layout):
+    if not is_alone(layout):
         drain = layout.standby_power * shortest + jnp.minimum(costs.work, costs.upload)[0]
         drain = jnp.where(layout.has_power, 0.0, drain * (1.0 - _ROUNDING))
         slots = jnp.minimum(slots, jnp.min(layout.capacity / drain) + 2)
@@ -64,7 +65,7 @@ def slot_costs(params: Params, layout: Layout, volumes: Num[Array, "H n"]) -> Sl
     For one UAV without depots they are the same. Otherwise all entries of a slot's ``duration`` are equal.
     """
     costs = demand.slot_costs(params, layout, volumes)
-    if _is_alone(layout):
+    if is_alone(layout):
         return costs
     shortest = shortest_slots(params, layout, volumes, fleet_size(layout)[None])
     return replace(costs, duration=jnp.broadcast_to(shortest, volumes.shape))
@@ -135,7 +136,32 @@ def counting_bound(params: Params, layout: Layout, costs: SlotCosts) -> Int[Arra
     return jnp.minimum(longest_feasible, params.max_slots).astype(jnp.int32)
 
 
-def _is_alone(layout: Layout) -> bool:
+def mean_slot(params: Params, layout: Layout) -> SlotCosts:
+    """Return :func:`demand.mean_slot` with the duration of :func:`slot_costs`; leaves ``[n]``."""
+    return jax.tree.map(lambda leaf: leaf[0], slot_costs(params, layout, demand.mean_volumes(params, layout)[None]))
+
+
+def visits_in(
+    params: Params, layout: Layout, states: State, slots: Num[ArrayLike, ""], shortest: Float[Array, ""]
+) -> Float[Array, " *W"]:
+    """Return the most visits that the fleet can make from each state in ``slots`` slots of ``shortest`` s or more.
+
+    Where no depot helps, a UAV hovers only as long as its energy lasts.
+    """
+    base, _ = demand.flight_power(params, fleet_of(params, layout))
+    lasts = jnp.floor(states.uav_energy * (1.0 + _ROUNDING) / jnp.maximum(base * shortest, 1e-3))
+    each = jnp.where(depots_help(layout, states)[..., None], slots, jnp.minimum(lasts, slots))
+    return jnp.sum(jnp.where(states.grounded, 0.0, each), axis=-1)
+
+
+def depots_help(layout: Layout, states: State) -> Bool[Array, " *W"]:
+    """Return whether a depot can still swap or charge in each state."""
+    if layout.depots is None:
+        return jnp.zeros(states.slot.shape, bool)
+    return jnp.any(can_help(layout.depots, states.packs), axis=-1)
+
+
+def is_alone(layout: Layout) -> bool:
     """Return whether there is one UAV and no depot, as in the paper."""
     return layout.n_uavs == 1 and not layout.n_depots
 

@@ -15,13 +15,14 @@ from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Policy
 from uavmec_jax.planning import demand
-from uavmec_jax.planning.deadlines import earliest_deadline
+from uavmec_jax.planning.fleet_deadlines import earliest_deadline, split_deadline
+from uavmec_jax.planning.fleet_rules import for_fleets
 from uavmec_jax.planning.shortest_tour import shortest_tour
 
 
 def stay_put(params: Params, layout: Layout, state: State, key: PRNGKeyArray | None = None) -> Array:
-    """Hover above the first device for the whole episode."""
-    return jnp.zeros((), jnp.int32)
+    """Hover above the first device for the whole episode; the UAVs of a fleet hover above the first ones."""
+    return jnp.argmax(state.age >= 0).astype(jnp.int32)
 
 
 def random(params: Params, layout: Layout, state: State, key: PRNGKeyArray | None = None) -> Array:
@@ -71,14 +72,17 @@ def shortest_life(params: Params, layout: Layout, state: State, key: PRNGKeyArra
 
 HEURISTICS: Mapping[str, Policy] = MappingProxyType(
     {
-        "stay-put": stay_put,
-        "random": random,
-        "round-robin": round_robin,
-        "oldest-first": oldest_first,
-        "lowest-battery": lowest_battery,
-        "shortest-life": shortest_life,
-        "shortest-tour": shortest_tour,
+        "stay-put": for_fleets(stay_put),
+        "random": for_fleets(random),
+        "round-robin": for_fleets(round_robin),
+        "oldest-first": for_fleets(oldest_first),
+        "lowest-battery": for_fleets(lowest_battery),
+        "shortest-life": for_fleets(shortest_life),
+        "shortest-tour": for_fleets(shortest_tour),
         "earliest-deadline": earliest_deadline,
     }
 )
-"""Heuristics by name. None of them knows the task volumes of the slot that it decides about."""
+"""Heuristics by name, for any number of UAVs. None knows the task volumes of the slot that it decides about."""
+
+FLEET_HEURISTICS: Mapping[str, Policy] = MappingProxyType({**HEURISTICS, "split-deadline": split_deadline})
+"""All heuristics by name: those of :data:`HEURISTICS`, and those that are the same as one of them for one UAV."""

@@ -13,10 +13,11 @@ from jaxtyping import Array, Int, Key, Num
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Episode, Policy, rollout, rollout_with_actions, rollouts, tour_policy, volume_table
-from uavmec_jax.planning.beam import ValueFn, beam_search
+from uavmec_jax.planning.beam import beam_search
+from uavmec_jax.planning.beam_score import ValueFn
 from uavmec_jax.planning.bound import upper_bounds
-from uavmec_jax.planning.deadlines import earliest_deadline
-from uavmec_jax.planning.heuristics import HEURISTICS
+from uavmec_jax.planning.fleet_deadlines import earliest_deadline
+from uavmec_jax.planning.heuristics import FLEET_HEURISTICS
 from uavmec_jax.planning.rollout_planner import rollout_planner
 
 _CPU_BATCH = 64
@@ -35,8 +36,10 @@ def beam_episodes(
     slots: int,
     width: int,
     value_fn: ValueFn | None = None,
-) -> tuple[Int[Array, "B {slots}"], Episode]:
+) -> tuple[Int[Array, "B {slots} *K"], Episode]:
     """Return the tour of the clairvoyant beam for each of ``B`` scenarios, ``[B, slots]``, and its episode.
+
+    The tours of a fleet are ``[B, slots, K]``.
 
     Args:
         params: leaves ``[B]``.
@@ -47,7 +50,7 @@ def beam_episodes(
         value_fn: see :func:`beam_search`.
     """
 
-    def search(params: Params, layout: Layout, key: Key[Array, ""]) -> tuple[Int[Array, " H"], Episode]:
+    def search(params: Params, layout: Layout, key: Key[Array, ""]) -> tuple[Int[Array, "H *K"], Episode]:
         volumes = volume_table(params, layout.capacity.shape[0], key, slots)
         tour = beam_search(params, layout, volumes, width, value_fn=value_fn)
         return tour.actions, rollout(tour_policy(tour.actions), params, layout, key)
@@ -64,8 +67,10 @@ def rollout_planner_episodes(
     slots: int,
     samples: int,
     base: Policy = earliest_deadline,
-) -> tuple[Int[Array, "B {slots}"], Episode]:
+) -> tuple[Int[Array, "B {slots} *K"], Episode]:
     """Return the rollout planner's tour for each of ``B`` scenarios, ``[B, slots]``, and its episode.
+
+    The tours of a fleet are ``[B, slots, K]``.
 
     Args:
         params: leaves ``[B]``.
@@ -94,7 +99,7 @@ def heuristic_episodes(names: tuple[str, ...], params: Params, layouts: Layout, 
 
     def episodes(index: Int[Array, ""]) -> Episode:
         def policy(*arguments: Any) -> Array:
-            return jax.lax.switch(index, [HEURISTICS[name] for name in names], *arguments)
+            return jax.lax.switch(index, [FLEET_HEURISTICS[name] for name in names], *arguments)
 
         return jax.vmap(partial(rollouts, policy))(params, layouts, keys)
 

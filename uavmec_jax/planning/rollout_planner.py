@@ -1,6 +1,7 @@
 """The rollout planner: one step of policy improvement by Monte Carlo rollouts (Tesauro and Galperin 1996).
 
-It tries every device as the next visit and simulates how the episode continues under a base policy.
+It tries every place as the next target and simulates how the episode continues under a base policy; a fleet decides one UAV
+at a time.
 """
 
 from typing import TypeVar
@@ -14,7 +15,8 @@ from uavmec_jax.env.dynamics import State
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Episode, Policy, rollout_from
-from uavmec_jax.planning.deadlines import earliest_deadline
+from uavmec_jax.planning.fleet_deadlines import earliest_deadline
+from uavmec_jax.planning.fleet_demand import is_alone
 
 SAMPLES = 4
 """Futures simulated per candidate by default. 16 futures take four times the work for lifetimes that are 0.05 % longer."""
@@ -28,8 +30,12 @@ _A = TypeVar("_A", Array, np.ndarray)
 def rollout_planner(base: Policy = earliest_deadline, samples: int = SAMPLES) -> Policy:
     """Return a policy that simulates every candidate visit to the end and takes the one with the longest mean lifetime.
 
-    It is not clairvoyant: the task volumes, those of the present slot included, are drawn from its own key and are the
-    same for every candidate.
+    In a fleet, one UAV improves its part of the base policy's action at a time, in the order of their numbers, while the
+    later ones keep to the base policy (Bertsekas 2019): ``K (n + D)`` candidates instead of ``(n + D)^K``. With
+    ``end = "horizon"`` the value of a future is the time in service, not the lifetime.
+
+    The planner is not clairvoyant: the task volumes, those of the present slot included, are drawn from its own key and are
+    the same for every candidate.
 
     Args:
         base: decides in the slots after the candidate visit.
@@ -43,24 +49,58 @@ def rollout_planner(base: Policy = earliest_deadline, samples: int = SAMPLES) ->
         if key is None:
             raise ValueError("the rollout planner needs a key")
         choice = base(params, layout, state, key)
-        episodes = try_candidates(base, params, layout, state, jax.random.split(key, samples))
-        lifetimes = jnp.mean(episodes.length.astype(jnp.float32), axis=1)
-        return jnp.argmax(prefer(choice, lifetimes)).astype(jnp.int32)
+        futures = jax.random.split(key, samples)
+
+        def improve(uav: int | Int[Array, ""], action: Int[Array, "*K"]) -> Int[Array, "*K"]:
+            candidates = candidates_of(layout, action, uav)
+            episodes = try_candidates(base, params, layout, state, futures, candidates)
+            mine = action if layout.n_uavs == 1 else action[uav]
+            best = jnp.argmax(prefer(mine, jnp.mean(values_of(params, layout, episodes), axis=1)))
+            return candidates[best].astype(jnp.int32)
+
+        if layout.n_uavs == 1:
+            return improve(0, choice)
+        return jax.lax.fori_loop(0, layout.n_uavs, improve, choice)
 
     return policy
 
 
-def try_candidates(policy: Policy, params: Params, layout: Layout, state: State, futures: Key[Array, " S"]) -> Episode:
-    """Visit every device next in every future and follow the policy from then on; leaves ``[n, S, ...]``."""
+def candidates_of(layout: Layout, action: Int[Array, "*K"], uav: int | Int[Array, ""]) -> Int[Array, "n_places *K"]:
+    """Return the actions in which one UAV flies to each of the places and the others keep to ``action``."""
+    places = jnp.arange(layout.n_places)
+    if layout.n_uavs == 1:
+        return places
+    return jnp.where(jnp.arange(layout.n_uavs) == uav, places[:, None], action)
 
-    def episode(action: Int[Array, ""], future: PRNGKeyArray) -> Episode:
-        def visit_first(params: Params, layout: Layout, later: State, key: PRNGKeyArray | None = None) -> Array:
+
+def values_of(params: Params, layout: Layout, episodes: Episode) -> Float[Array, "*batch"]:
+    """Return what the planner makes as large as it can: the lifetimes, or with a horizon, the seconds in service.
+
+    For fleets the last slot counts up to the first failure in it: candidates that seem equal in whole slots are told apart.
+    """
+    if params.end == "horizon":
+        return jnp.asarray(episodes.service_s)
+    lifetimes = episodes.length.astype(jnp.float32)
+    return lifetimes if is_alone(layout) else lifetimes + (episodes.lasted - 1.0)
+
+
+def try_candidates(
+    policy: Policy,
+    params: Params,
+    layout: Layout,
+    state: State,
+    futures: Key[Array, " S"],
+    candidates: Int[Array, "C *K"],
+) -> Episode:
+    """Take every candidate action next in every future and follow the policy from then on; leaves ``[C, S, ...]``."""
+
+    def episode(action: Int[Array, "*K"], future: PRNGKeyArray) -> Episode:
+        def act_first(params: Params, layout: Layout, later: State, key: PRNGKeyArray | None = None) -> Array:
             return jnp.where(later.slot == state.slot, action, policy(params, layout, later, key))
 
-        return rollout_from(visit_first, params, layout, state, future)
+        return rollout_from(act_first, params, layout, state, future)
 
-    devices = jnp.arange(layout.capacity.shape[0])
-    return jax.vmap(jax.vmap(episode, (None, 0)), (0, None))(devices, futures)
+    return jax.vmap(jax.vmap(episode, (None, 0)), (0, None))(candidates, futures)
 
 
 def prefer(choice: Int[ArrayLike, ""], value: Float[_A, " n"]) -> Float[_A, " n"]:

@@ -4,11 +4,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from uavmec_jax.reporting.canvas import new_figure
+from uavmec_jax.reporting.formatting import slots
 from uavmec_jax.reporting.heat_map import draw_heat_map, heat_map_figure
 from uavmec_jax.reporting.table6 import is_table6, label_rewards
 from uavmec_jax.reporting.table7_figure import table7_figure
-from uavmec_jax.reporting.tables import is_grid
+from uavmec_jax.reporting.tables import by_fleet, is_grid
 from uavmec_jax.studies.first_failures import has_places
+from uavmec_jax.studies.measures import mostly_censored
 from uavmec_jax.studies.paper import TABLE5
 from uavmec_jax.studies.results import Results
 
@@ -53,7 +55,7 @@ def grid_figure(results: Results) -> Figure:
     longest = float(cells[[name for name, _ in panels]].max().max())
     paper = [TABLE5.get((p, c), np.nan) for p, c in zip(cells.powered, cells.connected, strict=True)]
     cells, panels = cells.assign(paper=paper), [*panels, ("paper", "the paper, Table 5")]
-    figure = heat_map_figure(cells, panels, _lifetime_limits(longest), "lifetime, slots")
+    figure = heat_map_figure([(cells, panels)], _lifetime_limits(longest), "lifetime, slots")
     seeds, steps = int(cells["seeds"].min()), results.study.steps
     figure.suptitle(f"{results.study.name}: {len(cells)} cells x {seeds} seeds, {steps:,} steps each", fontsize=11)
     return figure
@@ -62,19 +64,27 @@ def grid_figure(results: Results) -> Figure:
 def ladder_figure(results: Results) -> Figure:
     """Return lifetimes from the heuristics up to the upper bound as heat maps, or as bars where there is no grid.
 
-    They are those on the planners' draws, if there are any.
+    They are those on the planners' draws, if there are any. Each fleet has a row of heat maps. Means over cells are without
+    those that are mostly censored.
     """
     cells = results.cells()
     names = [name for name in _LADDER if name in cells or f"{name}_planned" in cells] or results.policies
     panels = [(f"{name}_planned" if f"{name}_planned" in cells else name, _LADDER.get(name, name)) for name in names]
-    if is_grid(results):
+    fleets = by_fleet(results)
+    if all(map(is_grid, fleets.values())):
         longest = float(cells[[name for name, _ in panels]].max().max())
-        titled = [(name, f"{title}: {cells[name].mean():.1f}") for name, title in panels]
-        figure = heat_map_figure(cells, titled, _lifetime_limits(longest), "lifetime, slots")
+        rows = []
+        for start, fleet in fleets.items():
+            of_fleet = fleet.cells()
+            kept = of_fleet[~mostly_censored(of_fleet, names)]
+            titled = [(name, f"{start}{title}: {slots(kept[name].mean())}") for name, title in panels]
+            rows.append((of_fleet, titled))
+        figure = heat_map_figure(rows, _lifetime_limits(longest), "lifetime, slots")
     else:
         figure = new_figure(7, 3.6)
         axis = figure.subplots()
-        axis.barh([title for _, title in panels], [cells[name].mean() for name, _ in panels])
+        kept = cells[~mostly_censored(cells, names)]
+        axis.barh([title for _, title in panels], [kept[name].mean() for name, _ in panels])
         axis.set_xlabel("lifetime, slots")
     layouts = int(cells["seeds"].min())
     figure.suptitle(f"{results.study.name}: {len(cells)} cells x {layouts} layouts", fontsize=11)

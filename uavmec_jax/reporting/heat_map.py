@@ -31,24 +31,26 @@ def draw_heat_map(axis: Axes, table: pd.DataFrame, limits: tuple[float, float]) 
 
 
 def heat_map_figure(
-    cells: pd.DataFrame, panels: Sequence[tuple[str, str]], limits: tuple[float, float], quantity: str
+    rows: Sequence[tuple[pd.DataFrame, Sequence[tuple[str, str]]]], limits: tuple[float, float], quantity: str
 ) -> Figure:
-    """Draw heat maps over powered x connected devices side by side, on one colour scale.
+    """Draw rows of heat maps over powered x connected devices, on one colour scale.
 
     Args:
-        cells: one row per cell, with ``powered``, ``connected`` and the columns of the panels.
-        panels: a column of ``cells`` and a title for each heat map.
+        rows: for each row of heat maps, its cells (one row per cell, with ``powered``, ``connected`` and the columns of the
+            panels), and its panels: a column of the cells and a title for each heat map.
         limits: of the colour scale.
         quantity: label of the colour scale.
     """
-    figure = new_figure(3.3 * len(panels), 3.6)
-    axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-    for axis, (column, title) in zip(axes, panels, strict=True):
-        table = cells.pivot(index="powered", columns="connected", values=column)
-        table = table.sort_index(ascending=False).sort_index(axis=1, ascending=False)
-        image = draw_heat_map(axis, table, limits)
-        axis.set_title(title, fontsize=10)
-        axis.set_xlabel("connected devices")
-    axes[0].set_ylabel("powered devices")
+    width = len(rows[0][1])
+    figure = new_figure(3.3 * width, 3.6 * len(rows))
+    axes = figure.subplots(len(rows), width, sharey="row", squeeze=False)
+    for row, (cells, panels) in zip(axes, rows, strict=True):
+        for axis, (column, title) in zip(row, panels, strict=True):
+            table = cells.pivot(index="powered", columns="connected", values=column)
+            table = table.sort_index(ascending=False).sort_index(axis=1, ascending=False)
+            image = draw_heat_map(axis, table, limits)
+            axis.set_title(title, fontsize=10)
+            axis.set_xlabel("connected devices")
+        row[0].set_ylabel("powered devices")
     figure.colorbar(image, ax=axes, label=quantity, shrink=0.8)
     return figure

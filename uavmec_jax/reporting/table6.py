@@ -7,7 +7,7 @@ import pandas as pd
 from rich.table import Table
 from rich.text import Text
 
-from uavmec_jax.reporting.formatting import column_name, half_interval
+from uavmec_jax.reporting.formatting import censored, column_name, half_interval, slots
 from uavmec_jax.studies.paper import TABLE6
 from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.schema import PLANNERS
@@ -70,11 +70,13 @@ def table6_table(cells: pd.DataFrame) -> Table:
 def _entry(cell: Any, highest: float) -> Text:
     paper = TABLE6.get((cell["reward"], cell["powered"], cell["connected"], cell["algorithm"]))
     text = Text(f"{cell['best']:.1f}", style="bold" if cell["best"] == highest else "default")
-    text.append(half_interval(cell["best_low"], cell["best_high"]), style="dim not bold")
+    text.append(half_interval(cell["best_low"], cell["best_high"]) + censored(cell, "best"), style="dim not bold")
     text.append(f"\n{cell['best_max']:.1f}", style="not bold")
     text.append(f" / {paper:g}" if paper is not None else " / -", style="not bold")
     text.append(f"\n{cell['last']:.1f}", style="dim not bold")
-    return text.append(half_interval(cell["last_low"], cell["last_high"]), style="dim not bold")
+    return text.append(
+        half_interval(cell["last_low"], cell["last_high"]) + censored(cell, "last"), style="dim not bold"
+    )
 
 
 def _untrained_table(cells: pd.DataFrame) -> Table:
@@ -84,7 +86,7 @@ def _untrained_table(cells: pd.DataFrame) -> Table:
     for column in ("powered / connected", *policies):
         table.add_column(column_name(column.removesuffix("_planned")), justify="right")
     for (powered, connected), group in cells.groupby(["powered", "connected"], sort=False):
-        table.add_row(f"{powered} / {connected}", *(f"{group[policy].iloc[0]:.1f}" for policy in policies))
+        table.add_row(f"{powered} / {connected}", *(slots(group[policy].iloc[0]) for policy in policies))
     return table
 
 

@@ -6,7 +6,7 @@ import pandas as pd
 from rich.table import Table
 from rich.text import Text
 
-from uavmec_jax.reporting.formatting import axis_values, column_name, half_interval
+from uavmec_jax.reporting.formatting import axis_values, censored, column_name, half_interval, slots
 from uavmec_jax.studies.axes import TRAFFIC_WEIGHTS
 from uavmec_jax.studies.first_failures import LEARNED, first_failure_groups, traffic_claims, with_traffic
 from uavmec_jax.studies.paper import TABLE7
@@ -60,13 +60,15 @@ def lifetime_table(results: Results) -> Table:
     learned = [name for name in LEARNED if name in cells]
     others = [name for name in results.policies if name not in LEARNED]
     planners = [f"{name}_planned" for name in PLANNERS if f"{name}_planned" in cells]
+    shown = [*learned, *others, *planners]
     for axis in axes:
         table.add_column(axis)
-    for name in ("traffic", *learned, *others, *planners):
+    for name in ("traffic", *shown):
         table.add_column(_short_name(name.removesuffix("_planned")), justify="left" if name == "traffic" else "right")
     for cell in cells.to_dict("records"):
         means = [f"{cell[name]:.1f}{half_interval(cell[f'{name}_low'], cell[f'{name}_high'])}" for name in learned]
-        means += [f"{cell[name]:.1f}" for name in (*others, *planners)]
+        means += [slots(cell[name]) for name in (*others, *planners)]
+        means = [mean + censored(cell, name.removesuffix("_planned")) for mean, name in zip(means, shown, strict=True)]
         table.add_row(*axis_values(cell, axes), traffic_label(cell), *means)
     return table
 

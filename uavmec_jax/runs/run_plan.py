@@ -9,8 +9,9 @@ from typing import Any
 import jax
 
 from uavmec_jax.errors import StudyError
+from uavmec_jax.studies.parts import split_study
 from uavmec_jax.studies.places import describe_places, load_evacuations
-from uavmec_jax.studies.population import make_algorithm, n_agents, seeds_of, split_by_algorithm
+from uavmec_jax.studies.population import make_algorithm, n_agents, seeds_of
 from uavmec_jax.studies.results import SCHEMA
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.training import host
@@ -25,17 +26,17 @@ BYTES_WITHOUT_TRAINING = 100_000
 
 @dataclass(frozen=True)
 class Shard:
-    """Agents of one algorithm that one process trains and evaluates together.
+    """Agents of one part of the study that one process trains and evaluates together.
 
     Attributes:
         number: its place in the plan, from 0.
-        algorithm: name of the algorithm, ``none`` where nothing is trained.
-        first: its first agent, counted among those of the algorithm.
-        agents: number of agents, without the padding to the common size of the algorithm's shards.
+        part: name of the part, see :class:`Part`: that of the algorithm, ``none`` where nothing is trained, and the fleet.
+        first: its first agent, counted among those of the part.
+        agents: number of agents, without the padding to the common size of the part's shards.
     """
 
     number: int
-    algorithm: str
+    part: str
     first: int
     agents: int
 
@@ -45,10 +46,10 @@ class RunPlan:
     """How a study is cut into shards. It is part of the result: the last bits depend on the size of a group.
 
     Attributes:
-        agents: number of agents of all algorithms.
-        partitions: algorithm -> how its agents are partitioned.
-        members: algorithm -> number of its agents.
-        steps: algorithm -> environment steps of one agent, in whole iterations; 0 where nothing is trained.
+        agents: number of agents of all parts.
+        partitions: part -> how its agents are partitioned.
+        members: part -> number of its agents.
+        steps: part -> environment steps of one agent, in whole iterations; 0 where nothing is trained.
         workers: number of processes that the plan is made for.
         free_bytes: free memory when the plan was made.
     """
@@ -62,7 +63,7 @@ class RunPlan:
 
     @cached_property
     def shards(self) -> list[Shard]:
-        """The shards in the order of the results, one algorithm after the other."""
+        """The shards in the order of the results, one part after the other."""
         shards: list[Shard] = []
         for name, partition in self.partitions.items():
             for first in range(0, partition.shards * partition.shard_size, partition.shard_size):
@@ -82,7 +83,7 @@ class RunPlan:
 
     def work_of(self, shard: Shard) -> int:
         """Return a shard's share of :attr:`work`."""
-        return shard.agents * (self.steps[shard.algorithm] or 1)
+        return shard.agents * (self.steps[shard.part] or 1)
 
     def __str__(self) -> str:
         if not self.total_steps:
@@ -123,8 +124,8 @@ def plan_run(study: Study, *, workers: int = 1, shard_size: int | None = None, j
     partitions: dict[str, Partition] = {}
     members: dict[str, int] = {}
     steps: dict[str, int] = {}
-    for part in split_by_algorithm(study):
-        name, algorithm, count = part.algorithm, make_algorithm(part), n_agents(part)
+    for part in split_study(study):
+        name, algorithm, count = part.name, make_algorithm(part.study), n_agents(part.study)
         max_shard = min(shard_size or count, -(-count // max(workers, jobs)))
         members[name], steps[name] = count, algorithm.total_steps if algorithm else 0
         if algorithm is None:

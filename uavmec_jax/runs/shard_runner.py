@@ -15,17 +15,19 @@ from uavmec_jax.runs.run_plan import RunPlan, Shard
 from uavmec_jax.studies.axes import TRACED_PARAMS
 from uavmec_jax.studies.evaluation import DistinctScenarios, evaluate_all, evaluate_learned
 from uavmec_jax.studies.evaluation_result import EvaluationResult
+from uavmec_jax.studies.parts import Part, split_study
 from uavmec_jax.studies.population import (
     AgentId,
+    clairvoyant_seeds,
     evaluation_keys,
     make_agent_ids,
     make_agents,
     make_algorithm,
-    split_by_algorithm,
     validation_keys,
 )
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.studies.shard_result import ShardResult
+from uavmec_jax.training.partition import Partition
 from uavmec_jax.training.training import Trainer, Training, Validation
 
 _SCENARIO_AXES = ("seed", "powered", "connected", "scenarios", "place", *TRACED_PARAMS)
@@ -33,7 +35,7 @@ _SCENARIO_AXES = ("seed", "powered", "connected", "scenarios", "place", *TRACED_
 
 
 class ShardRunner:
-    """Trains and evaluates the shards of one study; each algorithm is compiled once."""
+    """Trains and evaluates the shards of one study; each of its parts is compiled once."""
 
     def __init__(self, study: Study, plan: RunPlan, reward: Callable[[Mapping[str, Any]], Any] | None = None) -> None:
         """Prepare for a study.
@@ -45,34 +47,39 @@ class ShardRunner:
         """
         replacement = make_reward(reward, study.guard) if reward is not None else None
         self._runners = {
-            part.algorithm: _AlgorithmRunner(part, plan, "algorithm" in study.axes, replacement)
-            for part in split_by_algorithm(study)
+            part.name: _PartRunner(part, plan.partitions[part.name], replacement) for part in split_study(study)
         }
 
     def start(self, shard: Shard) -> Training | None:
         """Start the training of a shard; ``None`` where nothing is trained."""
-        return self._runners[shard.algorithm].start(shard)
+        return self._runners[shard.part].start(shard)
 
     def finish(self, shard: Shard, training: Training | None) -> ShardResult:
         """Evaluate a shard whose training is finished, or which needs none."""
-        return self._runners[shard.algorithm].finish(shard, training)
+        return self._runners[shard.part].finish(shard, training)
+
+    def algorithm(self, shard: Shard) -> str:
+        """Return the name of a shard's algorithm, ``none`` where nothing is trained."""
+        return self._runners[shard.part].study.algorithm
 
     def agent_ids(self, shard: Shard) -> list[AgentId]:
         """Return the identities of a shard's agents."""
-        return self._runners[shard.algorithm].agent_ids[shard.first : shard.first + shard.agents]
+        return self._runners[shard.part].agent_ids[shard.first : shard.first + shard.agents]
 
 
 @dataclass
-class _AlgorithmRunner:
-    """Runs the shards of a study of one algorithm, or of none."""
+class _PartRunner:
+    """Runs the shards of one part of a study."""
 
-    study: Study
-    plan: RunPlan
-    names_algorithm: bool
-    """Whether the table of agents has a column for the algorithm."""
+    part: Part
+    partition: Partition
     reward: Reward | None
     trainer: Trainer | None = None
     """Compiled with the first shard."""
+
+    @property
+    def study(self) -> Study:
+        return self.part.study
 
     @cached_property
     def agent_ids(self) -> list[AgentId]:
@@ -84,9 +91,8 @@ class _AlgorithmRunner:
 
     def members(self, shard: Shard) -> tuple[list[AgentId], Agent]:
         """Make the agents of a shard; the last one is repeated as padding."""
-        size = self.plan.partitions[self.study.algorithm].shard_size
         agent_ids = self.agent_ids[shard.first : shard.first + shard.agents]
-        agent_ids = agent_ids + [agent_ids[-1]] * (size - shard.agents)
+        agent_ids = agent_ids + [agent_ids[-1]] * (self.partition.shard_size - shard.agents)
         return agent_ids, make_agents(self.study, self.reward, agent_ids)
 
     def start(self, shard: Shard) -> Training | None:
@@ -96,9 +102,9 @@ class _AlgorithmRunner:
         keys = validation_keys(self.study, agent_ids)
         if self.trainer is not None:
             return self.trainer.start(agents, keys)
-        settings, partition = self.study.evaluation, self.plan.partitions[self.study.algorithm]
+        settings = self.study.evaluation
         validation = Validation(every=settings.validate_every, draws=settings.validation_draws)
-        self.trainer = Trainer.compile(self.algorithm, agents, keys, validation, partition)
+        self.trainer = Trainer.compile(self.algorithm, agents, keys, validation, self.partition)
         training = self.trainer.start(agents, keys)
         training.seconds["compile"] = self.trainer.compile_seconds
         return training
@@ -110,8 +116,9 @@ class _AlgorithmRunner:
         members, keys = jax.tree.map(lambda leaf: leaf[: shard.agents], (agents, keys))
         rows = pd.DataFrame(agent_ids[: shard.agents])
         distinct = DistinctScenarios.of(rows[_scenario_columns(rows)])
-        if self.names_algorithm:
-            rows.insert(3, "algorithm", self.study.algorithm)
+        clairvoyant = rows["seed"].isin(clairvoyant_seeds(self.study)).to_numpy()
+        for name, value in reversed(self.part.values.items()):
+            rows.insert(min(3, rows.shape[1]), name, value)
         weights: dict[str, Any] = {}
         curves: dict[str, Any] = {}
         learned: dict[str, EvaluationResult] = {}
@@ -127,7 +134,8 @@ class _AlgorithmRunner:
                 best_validation=trained.best_score,
             )
             learned = evaluate_learned(self.algorithm, members, keys, weights)
-        columns, evaluation, planning = evaluate_all(members, keys, learned, distinct, self.study.evaluation)
+        settings = self.study.evaluation
+        columns, evaluation, planning = evaluate_all(members, keys, learned, distinct, settings, clairvoyant)
         seconds = {"evaluate": time.perf_counter() - started - planning, "plan": planning}
         return ShardResult(
             algorithm=self.study.algorithm,

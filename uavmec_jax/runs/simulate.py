@@ -12,7 +12,8 @@ from uavmec_jax.runs.checkpoints import interval_s
 from uavmec_jax.runs.options import RunOptions
 from uavmec_jax.runs.run_plan import RunPlan
 from uavmec_jax.studies.axes import TRACED_PARAMS
-from uavmec_jax.studies.population import n_agents, split_by_algorithm
+from uavmec_jax.studies.parts import split_study
+from uavmec_jax.studies.population import n_agents
 from uavmec_jax.studies.schema import Study
 
 # Measured on two cores of a laptop-sized machine; see results/simulation.
@@ -91,9 +92,9 @@ def simulate(
     training = other = checkpoints = shards = results = 0.0
     groups = max(partition.groups for partition in plan.partitions.values())
     workers = max(min(devices // groups, len(plan.shards)), 1)
-    for sub_study in split_by_algorithm(study):
-        name, evaluation = sub_study.algorithm, sub_study.evaluation
-        partition, members, steps = plan.partitions[name], plan.members[name], plan.steps[name]
+    for part in split_study(study):
+        name, evaluation = part.study.algorithm, part.study.evaluation
+        partition, members, steps = plan.partitions[part.name], plan.members[part.name], plan.steps[part.name]
         rounds = math.ceil(partition.shards / workers)
         if steps:
             device_speed = speed[name] if isinstance(speed, Mapping) else speed
@@ -105,10 +106,10 @@ def simulate(
         if evaluation.planners:
             draws = min(evaluation.planner_draws, evaluation.draws)
             share_of_worker = min(rounds * partition.shard_size / members, 1.0)
-            other += _COMPILE_S["planners"] + _PLANNING_S * _distinct_scenarios(sub_study) * draws * share_of_worker
+            other += _COMPILE_S["planners"] + _PLANNING_S * _distinct_scenarios(part.study) * draws * share_of_worker
         if evaluation.baselines or steps:
             other += _COMPILE_S["evaluation"]
-        result_bytes, episode_bytes = _agent_bytes(sub_study)
+        result_bytes, episode_bytes = _agent_bytes(part.study)
         shards += members * (result_bytes + episode_bytes)
         results += members * result_bytes
     largest = max(partition.shard_bytes for partition in plan.partitions.values())

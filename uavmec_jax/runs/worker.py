@@ -127,7 +127,7 @@ class Worker:
         lease.release()
 
     def _train_and_evaluate(self, shard: Shard, lease: Lease) -> ShardResult:
-        if self.folder.plan.steps[shard.algorithm] == 0:
+        if self.folder.plan.steps[shard.part] == 0:
             with self.stop.interruptible():
                 result = self.runner.finish(shard, None)
             self.on_progress(self._progress(shard, shard.agents, float("nan")))
@@ -168,10 +168,10 @@ class Worker:
         options = self.folder.options
 
         def collect(weights: dict) -> PolicyCollection:
-            agent_ids = {shard.algorithm: self.runner.agent_ids(shard)}
-            return policy_collection(self.folder.study, agent_ids, {shard.algorithm: weights})
+            algorithm = self.runner.algorithm(shard)
+            return policy_collection(self.folder.study, {algorithm: self.runner.agent_ids(shard)}, {algorithm: weights})
 
-        size = self.folder.plan.partitions[shard.algorithm].shard_bytes
+        size = self.folder.plan.partitions[shard.part].shard_bytes
         return Checkpoints(
             folder=self.folder.shard_folder(shard),
             kind=options.checkpoint,

@@ -9,8 +9,9 @@ import numpy as np
 from pydantic import Field
 
 from uavmec_jax.env import hardware
+from uavmec_jax.env.fleet import UAV_FIELDS
 from uavmec_jax.env.generator import ScenarioDistribution
-from uavmec_jax.env.layout import Layout
+from uavmec_jax.env.layout import Layout, fleet_of
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rewards import Reward
 from uavmec_jax.files.validation import from_array, model_from_dataclasses
@@ -92,12 +93,25 @@ def out_of_distribution(
         for name, (values, bounds) in _drawn_quantities(scenarios, trained, params, layout).items()
         if np.min(values) < bounds[0] * (1 - 1e-6) or np.max(values) > bounds[1] * (1 + 1e-6)
     ]
-    constant = {name: getattr(params, name) for name in trained if name not in _NOT_CONSTANT}
-    return outside + [
-        f"{name}: {value}; it was trained on {trained[name]}"
-        for name, value in constant.items()
-        if not np.allclose(np.asarray(value, float), np.asarray(trained[name], float), rtol=1e-5)
-    ]
+    return outside + _changed_constants({"end": "first_failure"} | dict(trained), params, layout)
+
+
+def _changed_constants(trained: Mapping[str, Any], params: Params, layout: Layout) -> list[str]:
+    """Describe each parameter that was the same in all scenarios of the training and is another one here."""
+    unused = () if params.end == "horizon" else ("horizon_s", "end_share")
+    changed = []
+    for name, value in trained.items():
+        if name in _NOT_CONSTANT or name in unused:
+            continue
+        here, field = getattr(params, name), name.removeprefix("uav_")
+        if layout.fleet is not None and field in UAV_FIELDS:
+            here = np.asarray(getattr(layout.fleet, field))
+        same = here == value if isinstance(value, str) else np.allclose(here, np.asarray(value, float), rtol=1e-5)
+        if not same:
+            changed.append(
+                f"{name}: {_span(here) if isinstance(here, np.ndarray) else here}; it was trained on {value}"
+            )
+    return changed
 
 
 _NOT_CONSTANT = ("n_devices", "region_m", "device_battery_range_j", "uav_battery_j", "uav_speed_m_s", "max_slots")
@@ -110,7 +124,8 @@ def _drawn_quantities(
     """Return each quantity that a distribution draws: its values in the scenario, and the range they were drawn from."""
     low, high = (trained["device_battery_range_j"][side] * scenarios["battery_factor"][side] for side in (0, 1))
     devices, factors = jax.tree.map(np.asarray, layout), scenarios["hardware_factor"]
-    extent = float(np.max(np.ptp(np.concatenate([devices.position, np.zeros((1, 2))]), axis=0)))
+    extent = float(np.max(np.ptp(np.concatenate([layout.places(), np.zeros((1, 2))]), axis=0)))
+    fleet = fleet_of(params, layout)
     hardware_range = lambda table: (table.min() * factors[0], table.max() * factors[1])  # noqa: E731
     uav_range = lambda name: tuple(trained[name] * factor for factor in scenarios["uav_factor"])  # noqa: E731
     return {
@@ -120,8 +135,10 @@ def _drawn_quantities(
         "standby powers in W": (devices.standby_power, hardware_range(hardware.STANDBY_POWER_W)),
         "active powers in W": (devices.active_power, hardware_range(hardware.ACTIVE_POWER_W)),
         "processing rates in bytes/s": (devices.processing_rate, hardware_range(hardware.PROCESSING_RATE_BYTES_S)),
-        "the UAV's battery in J": (params.uav_battery_j, uav_range("uav_battery_j")),
-        "the UAV's speed in m/s": (params.uav_speed_m_s, uav_range("uav_speed_m_s")),
+        "UAVs": (layout.n_uavs, (1, 1)),
+        "depots": (layout.n_depots, (0, 0)),
+        "the UAV's battery in J": (fleet.battery_j, uav_range("uav_battery_j")),
+        "the UAV's speed in m/s": (fleet.speed_m_s, uav_range("uav_speed_m_s")),
     }
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import pydantic
 
+from uavmec_jax.env.fleet import MAX_UAVS, DepotKind, make_depots, make_fleet
 from uavmec_jax.env.params import Params
 from uavmec_jax.errors import ScenarioError
 from uavmec_jax.files.validation import describe_error
@@ -26,6 +27,8 @@ def load_scenario(
     powered: int = 8,
     connected: int = 8,
     seed: int = 0,
+    uavs: int = 1,
+    depot: str | None = None,
     settings: dict[str, Any] | None = None,
 ) -> NamedScenario:
     """Load a scenario.
@@ -37,6 +40,8 @@ def load_scenario(
         powered: number of devices with grid power in a random scenario.
         connected: number of devices with communication in a random scenario.
         seed: seed of the random scenario and of the volume draws.
+        uavs: number of UAVs in a random scenario, all like that of the parameters. Devices and draws do not depend on it.
+        depot: kind of the depot, ``"swap"`` or ``"charge"``, at the origin of a random scenario; ``None`` for no depot.
         settings: scenario parameters to change, by name.
 
     Raises:
@@ -49,14 +54,31 @@ def load_scenario(
     if file is not None:
         scenario = replace(load_scenario_file(file, settings), draw_id=(seed, 0, 0))
     else:
-        scenario = _random_scenario(_make_params(settings or {}), place, powered, connected, seed)
+        params = _make_params(settings or {})
+        scenario = _random_scenario(params, place, powered, connected, seed, _vehicles(params, uavs, depot))
     return scenario if state is None else replace(scenario, state=load_state(state, scenario))
 
 
+def _vehicles(params: Params, uavs: int, depot: str | None) -> dict[str, Any]:
+    """Return the UAVs and the depot as fields of a layout; ``None`` for one UAV and for no depot."""
+    if not 1 <= uavs <= MAX_UAVS:
+        raise ScenarioError(f"uavs is {uavs}; give 1 to {MAX_UAVS}")
+    kinds = [kind.name.lower() for kind in DepotKind]
+    if depot is not None and depot not in kinds:
+        raise ScenarioError(f"depot is {depot!r}; give {' or '.join(kinds)}")
+    depots = None if depot is None else make_depots([[0.0, 0.0]], depot)
+    return {"depots": depots, "fleet": make_fleet(params, uavs, depots) if uavs > 1 else None}
+
+
 def _random_scenario(
-    params: Params, place: str | Path | None, powered: int, connected: int, seed: int
+    params: Params,
+    place: str | Path | None,
+    powered: int,
+    connected: int,
+    seed: int,
+    vehicles: dict[str, Any],
 ) -> NamedScenario:
-    """Return the scenario that studies train agents of this seed and these counts on."""
+    """Return the scenario that studies train agents of this seed and these counts on, with UAVs and depots added."""
     evacuation = None if place is None else load_evacuation(place)
     if evacuation is not None:
         params = replace(params, n_devices=evacuation.n_devices, region_m=evacuation.region_m())
@@ -69,6 +91,8 @@ def _random_scenario(
     if evacuation is not None:
         layout = on_place(layout, evacuation)
         name, device_names = f"{evacuation.name}, {name}", evacuation.meta["names"]
+    layout = replace(layout, **vehicles)
+    name += f", {layout.n_uavs} UAVs" * (layout.n_uavs > 1) + ", 1 depot" * layout.n_depots
     named = name_scenario(layout, params, name, device_names)
     return replace(named, layout=replace(named.layout, traffic=layout.traffic), draw_id=(seed, powered, connected))
 

@@ -54,16 +54,25 @@ def scenario_text(scenario: NamedScenario, suffix: str = ".toml") -> str:
     """Return the text of a scenario file, ``.toml`` or ``.csv``, from which an equal scenario is read back.
 
     Raises:
-        ScenarioError: a CSV was asked for, which cannot hold the scenario's parameters or origin.
+        ScenarioError: a CSV was asked for, and the scenario has more than devices.
     """
     file = scenario.file
-    devices = [device.model_dump(exclude_none=True) for device in file.device]
+    devices, depots, uavs = (
+        [table.model_dump(exclude_none=True) for table in tables] for tables in (file.device, file.depot, file.uav)
+    )
     if suffix == ".toml":
-        head = {"name": file.name} | ({"origin": list(file.origin)} if file.origin else {})
         params = file.params.model_dump(exclude_unset=True)
-        return tomli_w.dumps(head | ({"params": params} if params else {}) | {"device": devices})
-    if file.params.model_fields_set or file.origin:
-        raise ScenarioError(f"{file.name}: a CSV has no place for params and origin; write TOML")
+        optional = {
+            "origin": file.origin and list(file.origin),
+            "region": file.region and [list(corner) for corner in file.region],
+            "params": params,
+        }
+        tables = {"device": devices, "depot": depots, "uav": uavs}
+        head = {"name": file.name} | {name: value for name, value in optional.items() if value}
+        return tomli_w.dumps(head | {name: table for name, table in tables.items() if table})
+    more = {"params": file.params.model_fields_set, "origin": file.origin, "region": file.region}
+    if given := [name for name, value in (more | {"depots": depots, "UAVs": uavs}).items() if value]:
+        raise ScenarioError(f"{file.name}: a CSV has no place for {' and '.join(given)}; write TOML")
     columns = [field for field in Device.model_fields if any(field in device for device in devices)]
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, lineterminator="\n")

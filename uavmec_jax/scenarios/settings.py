@@ -8,6 +8,11 @@ from uavmec_jax.files.validation import model_from_dataclasses
 ParamsSettings: Any = model_from_dataclasses("ParamsSettings", Params)
 
 
+def unused_params(settings: Any) -> set[str]:
+    """Return the names of the parameters without a meaning: those of a horizon, unless episodes end at one."""
+    return set() if settings.end == "horizon" else {"end", "horizon_s", "end_share"}
+
+
 def check_ranges(settings: Any, where: str) -> None:
     """Check that the lower end of every range of scenario parameters is positive and not above its upper end.
 

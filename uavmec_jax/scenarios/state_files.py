@@ -10,29 +10,30 @@ import pydantic
 from jaxtyping import Int, Num
 from pydantic import Field
 
-from uavmec_jax.env.dynamics import State, complete_state, slots_to_expiry
+from uavmec_jax.env.dynamics import State, slots_to_expiry
 from uavmec_jax.errors import StateError
 from uavmec_jax.files.reading import read_text
-from uavmec_jax.files.validation import StrictModel, describe_error, from_array
+from uavmec_jax.files.validation import describe_error, from_array
 from uavmec_jax.scenarios.named_scenario import NamedScenario
+from uavmec_jax.scenarios.uav_states import Number, UavStates, by_name, depot_packs, name_uavs, uav_arrays, uav_data
 
-_Number = Annotated[float, Field(allow_inf_nan=True)]  # refused below, in a message that names the device
+_MAX_SLOTS = 1_000_000
 
 
-class StateFile(StrictModel):
-    """Contents of a state file; what is left out is as in the initial state."""
+class StateFile(UavStates):
+    """Contents of a state file; what is left out is as in the initial state.
 
-    battery_j: Annotated[tuple[_Number, ...] | dict[str, _Number] | None, from_array] = None
-    """Energy left in each device, J, in the order of the scenario file or by name."""
+    Values of several devices, UAVs or depots are in the order of the scenario file or by name.
+    """
+
+    battery_j: Annotated[tuple[Number, ...] | dict[str, Number] | None, from_array] = None
+    """Energy left in each device, J."""
     age_slots: Annotated[tuple[int, ...] | dict[str, int] | None, from_array] = None
     """Slots since each device's data were last delivered."""
-    uav_at: str | None = None
-    """Name of the device above which the UAV hovers."""
-    uav_position_m: Annotated[tuple[_Number, _Number] | None, from_array] = None
-    """Position of the UAV, metres from the corner where it started."""
-    uav_energy_j: _Number | None = None
-    """Energy left in the UAV, J."""
-    slot: Annotated[int, Field(ge=0)] = 0
+    failed_at: Annotated[tuple[int, ...] | dict[str, int] | None, from_array] = None
+    """Number of slots that were completed when each battery ran out, -1 for devices that work; only if ``params.end`` is
+    ``horizon``."""
+    slot: Annotated[int, Field(ge=0, le=_MAX_SLOTS)] = 0
     """Number of completed slots."""
     elapsed_s: Annotated[float, Field(ge=0)] = 0.0
     """Duration of the completed slots, s."""
@@ -67,90 +68,107 @@ def make_state(data: dict[str, Any], scenario: NamedScenario, source: str) -> St
         StateError: a value does not fit the scenario; one line that names it.
     """
     try:
-        file = StateFile.model_validate(data)
+        file = StateFile.model_validate(name_uavs(data, scenario))
+        return _build(file, scenario)
     except pydantic.ValidationError as error:
         raise StateError(describe_error(source, error, StateFile)) from None
-    try:
-        return _build(file, scenario)
     except ValueError as error:
         raise StateError(f"{source}: {error}") from None
 
 
 def _build(file: StateFile, scenario: NamedScenario) -> State:
-    capacity, uav_battery = np.asarray(scenario.layout.capacity, float), float(scenario.params.uav_battery_j)
-    battery = _by_device("battery_j", file.battery_j, np.asarray(scenario.state.battery, float), scenario)
-    age = _by_device("age_slots", file.age_slots, np.asarray(scenario.state.age), scenario)
-    _check_devices(battery, age, scenario)
-    energy = uav_battery if file.uav_energy_j is None else file.uav_energy_j
-    if not 0 < energy <= uav_battery * (1 + 1e-6):
-        raise ValueError(f"uav_energy_j is {energy:g}; give more than 0 and at most {uav_battery:g}")
-    state = State(
+    names, initial = scenario.device_names, scenario.state
+    capacity = np.asarray(scenario.layout.capacity, float)
+    failed_at = by_name("failed_at", file.failed_at, np.asarray(initial.failed_at), names, "device")
+    full = np.where(failed_at < 0, np.asarray(initial.battery, float), 0.0)
+    battery = by_name("battery_j", file.battery_j, full, names, "device")
+    age = by_name("age_slots", file.age_slots, np.asarray(initial.age), names, "device")
+    _check_failures(file, failed_at, scenario)
+    _check_devices(battery, age, failed_at, scenario)
+    position, energy, grounded = uav_arrays(file, scenario)
+    return State(
         battery=jnp.asarray(np.minimum(battery, capacity), jnp.float32),
         age=jnp.where(scenario.layout.has_comms, 0, jnp.asarray(age, jnp.int32)),
-        uav_position=jnp.asarray(_uav_position(file, scenario), jnp.float32)[None],
-        uav_energy=jnp.float32(min(energy, uav_battery))[None],
+        uav_position=jnp.asarray(position, jnp.float32),
+        uav_energy=jnp.asarray(energy, jnp.float32),
         slot=jnp.int32(file.slot),
         elapsed=jnp.float32(file.elapsed_s),
+        grounded=jnp.asarray(grounded),
+        failed_at=jnp.asarray(failed_at, jnp.int32),
+        packs=jnp.asarray(depot_packs(file.packs, scenario), jnp.float32),
     )
-    return complete_state(scenario.layout, state)
 
 
-def _check_devices(battery: Num[np.ndarray, " n"], age: Int[np.ndarray, " n"], scenario: NamedScenario) -> None:
-    """Check that no battery is empty or above its capacity, and that no data have expired."""
-    limit = int(slots_to_expiry(scenario.params))
-    capacities = np.asarray(scenario.layout.capacity, float)
-    devices = zip(scenario.device_names, battery, age, capacities, strict=True)
-    for number, (name, energy, slots, capacity) in enumerate(devices, 1):
-        where = f"device {number} ({name}): "
-        if not 0 < energy <= capacity * (1 + 1e-6):
-            raise ValueError(f"{where}battery_j is {energy:g}; give more than 0 and at most {capacity:g}, its capacity")
-        if not 0 <= slots < limit:
-            raise ValueError(f"{where}age_slots is {slots}; give 0 to {limit - 1}: older data have expired")
-
-
-def _by_device(
-    field: str, values: Any, defaults: Num[np.ndarray, " n"], scenario: NamedScenario
-) -> Num[np.ndarray, " n"]:
-    """Return one value per device, from a list in their order or from a dictionary with some of their names."""
-    names = scenario.device_names
-    if values is None:
-        return defaults
-    if isinstance(values, dict):
-        for name in values:
-            if name not in names:
-                raise ValueError(f"{field} names {name!r}; the devices are {', '.join(names)}")
-        return np.array([values.get(name, default) for name, default in zip(names, defaults, strict=True)])
-    if len(values) != len(names):
-        raise ValueError(f"{field} has {len(values)} values; give {len(names)}, one for each device")
-    return np.array(values)
-
-
-def _uav_position(file: StateFile, scenario: NamedScenario) -> Num[np.ndarray, "2"]:
-    """Return the position of the UAV in metres from the corner where it started."""
-    if file.uav_at is not None and file.uav_position_m is not None:
-        raise ValueError("uav_at and uav_position_m are both given; leave one of them out")
-    if file.uav_at is not None:
-        if file.uav_at not in scenario.device_names:
-            raise ValueError(f"uav_at is {file.uav_at!r}; the devices are {', '.join(scenario.device_names)}")
-        return np.asarray(scenario.layout.position[scenario.device_names.index(file.uav_at)])
-    position = np.zeros(2) if file.uav_position_m is None else np.array(file.uav_position_m)
-    sides = np.asarray(scenario.params.region_m, float)
-    if not np.all(np.isfinite(position)) or np.any(position < -sides) or np.any(position > 2 * sides):
+def _check_failures(file: StateFile, failed_at: Int[np.ndarray, " n"], scenario: NamedScenario) -> None:
+    """Check that batteries ran out only where the episode goes on without them, and in slots that are completed."""
+    if file.failed_at is not None and scenario.params.end != "horizon":
         raise ValueError(
-            f"uav_position_m is {position.tolist()}; give metres in or near the region of {sides.tolist()}"
+            'failed_at is given, but the first failure ends the episode; leave it out, or give params.end = "horizon"'
         )
-    return position
+    for number, (name, slot) in enumerate(zip(scenario.device_names, failed_at, strict=True), 1):
+        if not -1 <= slot <= file.slot:
+            raise ValueError(
+                f"device {number} ({name}): failed_at is {slot}; give 0 to {file.slot}, the number of completed slots, "
+                "or -1 if it works"
+            )
+
+
+def _check_devices(
+    battery: Num[np.ndarray, " n"],
+    age: Int[np.ndarray, " n"],
+    failed_at: Int[np.ndarray, " n"],
+    scenario: NamedScenario,
+) -> None:
+    """Check that no battery is empty or above its capacity unless it failed, and that no data have expired."""
+    goes_on = scenario.params.end == "horizon"
+    limit = _MAX_SLOTS + 1 if goes_on else int(slots_to_expiry(scenario.params))
+    capacities = np.asarray(scenario.layout.capacity, float)
+    devices = zip(scenario.device_names, battery, age, failed_at, capacities, strict=True)
+    for number, (name, energy, slots, failed, capacity) in enumerate(devices, 1):
+        where = f"device {number} ({name}): "
+        if failed >= 0 and energy != 0:
+            raise ValueError(f"{where}battery_j is {energy:g}, but failed_at is given; leave one of them out")
+        if failed < 0 and not 0 < energy <= capacity * (1 + 1e-6):
+            or_failed = ", or failed_at if it is empty" if goes_on else ""
+            raise ValueError(
+                f"{where}battery_j is {energy:g}; give more than 0 and at most {capacity:g}, its capacity{or_failed}"
+            )
+        if not 0 <= slots < limit:
+            reason = "" if goes_on else ": older data have expired"
+            raise ValueError(f"{where}age_slots is {slots}; give 0 to {limit - 1}{reason}")
 
 
 def state_data(scenario: NamedScenario) -> dict[str, Any]:
-    """Return the present state of a scenario as the contents of a state file."""
-    state, names = scenario.state, scenario.device_names
-    battery, age = np.asarray(state.battery), np.asarray(state.age)
+    """Return the present state of a scenario as the contents of a state file.
+
+    Numbers are rounded to thousandths where there is only the UAV of the parameters, no depot and no horizon; all others are
+    exact.
+    """
+    state, names, layout = scenario.state, scenario.device_names, scenario.layout
+    extended = layout.fleet is not None or layout.depots is not None or scenario.params.end == "horizon"
+    number = _exact if extended else _rounded
+    battery, age, failed_at = np.asarray(state.battery), np.asarray(state.age), np.asarray(state.failed_at)
+    if extended:
+        uavs = uav_data(scenario, number)
+        uavs |= {"failed_at": {name: int(slot) for name, slot in zip(names, failed_at, strict=True) if slot >= 0}}
+    else:
+        uavs = {
+            "uav_position_m": [number(x) for x in np.asarray(state.uav_position)[0]],
+            "uav_energy_j": number(state.uav_energy[0]),
+        }
     return {
-        "battery_j": {name: round(float(energy), 3) for name, energy in zip(names, battery, strict=True)},
+        "battery_j": {name: number(energy) for name, energy in zip(names, battery, strict=True)},
         "age_slots": {name: int(slots) for name, slots in zip(names, age, strict=True)},
-        "uav_position_m": [round(float(x), 3) for x in np.asarray(state.uav_position)[0]],
-        "uav_energy_j": round(float(state.uav_energy[0]), 3),
+        **{field: value for field, value in uavs.items() if value},
         "slot": int(state.slot),
-        "elapsed_s": round(float(state.elapsed), 3),
+        "elapsed_s": number(state.elapsed),
     }
+
+
+def _rounded(value: Any) -> float:
+    return round(float(value), 3)
+
+
+def _exact(value: Any) -> float:
+    """Return the decimal number with the fewest digits that is the same as a 32-bit float."""
+    return float(str(np.float32(value)))

@@ -7,8 +7,9 @@ from typing import Any
 import pydantic
 
 from uavmec_jax.agents.registry import ALGORITHMS
+from uavmec_jax.env.fleet import MAX_UAVS
 from uavmec_jax.env.params import Params
-from uavmec_jax.env.rewards import LOG_GUARDS, REWARDS, TERMS
+from uavmec_jax.env.rewards import LOG_GUARDS, REWARDS, SERVICE_TERM, TERMS
 from uavmec_jax.files.validation import expectation, suggest
 from uavmec_jax.scenarios.settings import ParamsSettings
 
@@ -22,7 +23,10 @@ TRACED_PARAMS = tuple(
 TRAFFIC_WEIGHTS = ("traffic_bonus", "traffic_penalty")
 """Settings that weigh traffic in the reward."""
 
-_OTHER_AXES = ("powered", "connected", "cells", "seeds", "algorithm", "reward", "guard", "place", *TRAFFIC_WEIGHTS)
+_OTHER_AXES = (
+    *("powered", "connected", "cells", "seeds", "algorithm", "reward", "guard", "place", *TRAFFIC_WEIGHTS),
+    *("uavs", "depots"),
+)
 
 
 def check_reward(where: str, reward: Any) -> None:
@@ -36,8 +40,9 @@ def check_reward(where: str, reward: Any) -> None:
             raise ValueError(f"{where} is {reward!r}, which is not a reward; {suggest(reward, REWARDS)}")
     else:
         for term in reward:
-            if term not in TERMS:
-                raise ValueError(f"{where} has the term {term!r}, which is not one; {suggest(term, TERMS)}")
+            if term not in (*TERMS, SERVICE_TERM):
+                known = suggest(term, (*TERMS, SERVICE_TERM))
+                raise ValueError(f"{where} has the term {term!r}, which is not one; {known}")
 
 
 def traced_settings(study: Any) -> tuple[str, ...]:
@@ -124,6 +129,10 @@ def _expected(study: Any, name: str, value: Any) -> str:
             fits, expected = value in tuple(ALGORITHMS), f"known: {', '.join(ALGORITHMS)}"
         case "seeds":
             fits, expected = is_whole and 0 <= value < 2**31, "give whole numbers from 0 to 2147483647"
+        case "uavs":
+            fits, expected = is_whole and 1 <= value <= MAX_UAVS, f"give whole numbers from 1 to {MAX_UAVS}"
+        case "depots":
+            fits, expected = is_whole and 0 <= value <= len(study.depot), expected_depots(study)
         case "guard":
             fits, expected = value in LOG_GUARDS, suggest(str(value), LOG_GUARDS)
         case "place":
@@ -133,6 +142,14 @@ def _expected(study: Any, name: str, value: Any) -> str:
         case _:
             return _expected_setting(study, name, value)
     return "" if fits else expected
+
+
+def expected_depots(study: Any) -> str:
+    """Return what would be right for a number of depots."""
+    most = len(study.depot)
+    return (
+        f"give whole numbers from 0 to {most}, the number of depot tables" if most else "add a table [[depot]] for each"
+    )
 
 
 def _expected_setting(study: Any, name: str, value: Any) -> str:

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Num
+from jaxtyping import Bool, Num
 from scipy import stats
 
 from uavmec_jax.errors import StudyError
+from uavmec_jax.studies.measures import MOST_CENSORED
 from uavmec_jax.studies.population import cell_axes
 from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.statistics import CONFIDENCE, mean_interval
@@ -45,7 +46,7 @@ class Side:
         return f"{self.results.study.name} {self.policy}{f' ({values})' if values else ''}"
 
     def lifetimes(self) -> pd.DataFrame:
-        """Return the agents that are compared: their values on all axes, and ``lifetime``.
+        """Return the agents that are compared: their axes, ``lifetime``, and the share of ``censored`` episodes.
 
         Raises:
             StudyError: there is no such policy, axis or agent.
@@ -61,31 +62,43 @@ class Side:
             agents = agents[agents[axis] == value]
         if agents.empty:
             raise StudyError(f"{self.name}: no agent is left")
-        return agents[[*axes, column]].rename(columns={column: "lifetime"})
+        censored = agents.get(f"{self.policy.replace('-', '_')}_censored", 0.0)
+        return agents[[*axes, column]].rename(columns={column: "lifetime"}).assign(censored=censored)
 
 
 def pair(a: Side, b: Side) -> tuple[pd.DataFrame, list[str]]:
     """Match the agents of two sides.
 
     Returns:
-        The agents that both sides have, one row each, with ``lifetime_a`` and ``lifetime_b``; and the axes of a cell.
+        The agents that both sides have, one row each, with ``lifetime_a`` and ``lifetime_b``, and if any episode of them is
+        censored, the shares ``censored_a`` and ``censored_b``; and the axes of a cell.
 
     Raises:
         StudyError: the sides have no agents in common, or an agent of one matches several of the other.
     """
     left, right = a.lifetimes(), b.lifetimes()
     pinned = {axis for axis in a.where if axis in b.where}  # each side has one value there, which may differ
-    shared = [str(axis) for axis in left if axis in set(right) - {"lifetime"} - pinned]
+    measures = ("lifetime", "censored")
+    shared = [str(axis) for axis in left if axis in set(right) - {*measures} - pinned]
     for side, table in ((a, left), (b, right)):
         if table.duplicated(shared).any():
-            others = [str(axis) for axis in table if axis not in (*shared, *pinned, "lifetime")]
+            others = [str(axis) for axis in table if axis not in (*shared, *pinned, *measures)]
             free = [axis for axis in others if table[axis].nunique() > 1]
             raise StudyError(f"{side.name}: several agents fit one of the other run; say which of {', '.join(free)}")
     both = left.merge(right, on=shared, suffixes=("_a", "_b"))
     if both.empty:
         raise StudyError(f"{a.name} and {b.name}: no agents in common on {', '.join(shared)}")
     cells = [axis for axis in shared if axis != "seed"]
-    return both[[*shared, "lifetime_a", "lifetime_b"]], cells
+    shares = [name for name in ("censored_a", "censored_b") if both[["censored_a", "censored_b"]].to_numpy().any()]
+    return both[[*shared, "lifetime_a", "lifetime_b", *shares]], cells
+
+
+def mostly_censored(both: pd.DataFrame, cells: list[str]) -> Bool[np.ndarray, " P"]:
+    """Return which pairs are in cells in which half or more of the episodes of a side are censored."""
+    if "censored_a" not in both:
+        return np.zeros(len(both), bool)
+    shares = both.groupby(cells, sort=False)[["censored_a", "censored_b"]].transform("mean")
+    return np.asarray((shares >= MOST_CENSORED).any(axis=1), bool)
 
 
 def differences(both: pd.DataFrame, cells: list[str]) -> pd.DataFrame:
@@ -95,17 +108,20 @@ def differences(both: pd.DataFrame, cells: list[str]) -> pd.DataFrame:
         mean, low, high = mean_interval((group["lifetime_b"] - group["lifetime_a"]).to_numpy())
         row = dict(zip(cells, cell, strict=True)) | {"seeds": len(group)}
         row |= {"a": group["lifetime_a"].mean(), "b": group["lifetime_b"].mean()}
+        row |= {name: group[name].mean() for name in ("censored_a", "censored_b") if name in group}
         rows.append(row | {"difference": mean, "low": low, "high": high})
     return pd.DataFrame(rows)
 
 
 def overall(both: pd.DataFrame, cells: list[str]) -> dict[str, _Interval]:
-    """Aggregate over all cells, with 95 % intervals from a bootstrap that is stratified by cell.
+    """Aggregate over the cells that are not mostly censored, with 95 % intervals from a bootstrap stratified by cell.
 
     Returns:
         ``difference``: mean paired difference b - a in slots; ``iqm_a``, ``iqm_b``: interquartile means in slots;
         ``improvement``: probability that the lifetime of b is longer than that of a in a random cell, ties counting half.
+        All are NaN if every cell is mostly censored.
     """
+    both = both[~mostly_censored(both, cells)]
     groups = [group[["lifetime_a", "lifetime_b"]].to_numpy() for _, group in both.groupby(cells, sort=False)]
     measures: dict[str, Callable[[list[np.ndarray]], float]] = {
         "difference": lambda sample: float(np.concatenate(sample).dot([-1.0, 1.0]).mean()),
@@ -115,6 +131,8 @@ def overall(both: pd.DataFrame, cells: list[str]) -> dict[str, _Interval]:
             np.mean([probability_of_improvement(pairs[:, 1], pairs[:, 0]) for pairs in sample])
         ),
     }
+    if not groups:
+        return dict.fromkeys(measures, (float("nan"),) * 3)
     rng, tail = np.random.default_rng(0), 50 * (1 - CONFIDENCE)
     samples = [[pairs[rng.integers(len(pairs), size=len(pairs))] for pairs in groups] for _ in range(_RESAMPLES)]
     single_seed = min(len(pairs) for pairs in groups) < 2

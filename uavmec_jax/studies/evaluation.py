@@ -10,7 +10,7 @@ import chex
 import jax
 import numpy as np
 import pandas as pd
-from jaxtyping import Array, Int, Key
+from jaxtyping import Array, Bool, Int, Key
 
 from uavmec_jax.agents.algorithm import Agent, Algorithm
 from uavmec_jax.env.generator import ScenarioDistribution
@@ -51,7 +51,7 @@ def _learned_episodes(algorithm: Algorithm, agents: Agent, keys: Key[Array, "A E
 
 
 def evaluate_heuristics(agents: Agent, keys: Key[Array, "A E"], names: Iterable[str]) -> dict[str, EvaluationResult]:
-    """Evaluate heuristics, by their names in :data:`HEURISTICS`, on every agent's scenario.
+    """Evaluate heuristics, by their names in :data:`FLEET_HEURISTICS`, on every agent's scenario.
 
     Args:
         agents: leaves ``[A, ...]``.
@@ -108,6 +108,7 @@ def evaluate_all(
     learned: dict[str, EvaluationResult],
     distinct: DistinctScenarios,
     settings: Evaluation,
+    clairvoyant: Bool[np.ndarray, " A"] | None = None,
 ) -> tuple[dict[str, Any], dict[str, np.ndarray], float]:
     """Evaluate heuristics and planners, and put their results beside those of the trained policies.
 
@@ -117,6 +118,7 @@ def evaluate_all(
         learned: results of the trained policies, from :func:`evaluate_learned`.
         distinct: which agents have the same scenario and draws.
         settings: which heuristics and planners.
+        clairvoyant: agents that beam and bound are evaluated for; ``None``: all.
 
     Returns:
         Columns of the tidy table; the fields of all results by ``policy/field``; and the seconds that the planners took.
@@ -126,7 +128,8 @@ def evaluate_all(
     lifetimes = [distinct.longest(result.lifetime) for result in learned.values()]
     lifetimes += [result.lifetime for result in heuristics.values()]
     started = time.perf_counter()
-    planners = evaluate_planners(firsts, draws[:, :-1], settings, lifetimes)
+    chosen = None if clairvoyant is None else clairvoyant[distinct.first]
+    planners = evaluate_planners(firsts, draws[:, :-1], settings, lifetimes, chosen)
     seconds = time.perf_counter() - started
     planners = {name: distinct.to_agents(result) for name, result in planners.items()}
     policies = learned | {name: distinct.to_agents(result) for name, result in heuristics.items()}

@@ -1,13 +1,17 @@
 """Results of evaluated policies and planners, and their columns in the tidy table."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int, Int8
+from jaxtyping import Bool, Float, Int, Int8
 
 from uavmec_jax.env.dynamics import Cause
+from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Episode
+
+MISSING = -1
+"""Lifetime and cause of episodes that were not evaluated; their other numbers are NaN."""
 
 
 @dataclass(frozen=True)
@@ -18,11 +22,13 @@ class EvaluationResult:
         lifetime: slots.
         cause: a :class:`Cause`.
         first_failure: share of each device in the first failure of an episode.
+        service_s: with ``end = "horizon"``, see :class:`Episode`; else ``None``.
     """
 
     lifetime: Int[np.ndarray, "A E"]
     cause: Int8[np.ndarray, "A E"]
     first_failure: Float[np.ndarray, "A E n"]
+    service_s: Float[np.ndarray, "A E"] | None = None
 
     @classmethod
     def of(cls, episodes: Episode) -> "EvaluationResult":
@@ -31,6 +37,7 @@ class EvaluationResult:
             lifetime=np.asarray(episodes.length),
             cause=np.asarray(episodes.cause, np.int8),
             first_failure=np.asarray(episodes.first_failure),
+            service_s=None if episodes.service_s is None else np.asarray(episodes.service_s),
         )
 
     @property
@@ -56,24 +63,56 @@ class EvaluationResult:
 class PlannerResult:
     """One planner on the first ``P`` held-out draws of each of ``A`` agents' scenarios.
 
+    Agents for which it was not evaluated have :data:`MISSING` and NaN.
+
     Attributes:
         lifetime: slots; of ``bound``, an upper bound on the lifetime under any policy.
         cause: a :class:`Cause`; ``None`` for the bound.
         first_failure: share of each device in the first failure of an episode; ``None`` for the bound.
+        service_s: with ``end = "horizon"``, see :class:`Episode`; else, and for the bound, ``None``.
     """
 
     lifetime: Int[np.ndarray, "A P"]
     cause: Int8[np.ndarray, "A P"] | None = None
     first_failure: Float[np.ndarray, "A P n"] | None = None
+    service_s: Float[np.ndarray, "A P"] | None = None
 
     @classmethod
-    def of(cls, episodes: Episode, shape: tuple[int, int]) -> "PlannerResult":
-        """Return the result of episodes, leaves ``[A * P, ...]``, with the axes ``shape = (A, P)``."""
+    def of(cls, episodes: Episode, draws: int) -> "PlannerResult":
+        """Return the result of episodes, leaves ``[A * P, ...]``, with ``P = draws``."""
+        by_agent = lambda leaf: np.asarray(leaf).reshape(-1, draws, *leaf.shape[1:])  # noqa: E731
         return cls(
-            lifetime=np.asarray(episodes.length).reshape(shape),
-            cause=np.asarray(episodes.cause, np.int8).reshape(shape),
-            first_failure=np.asarray(episodes.first_failure).reshape(*shape, -1),
+            lifetime=by_agent(episodes.length),
+            cause=by_agent(episodes.cause).astype(np.int8),
+            first_failure=by_agent(episodes.first_failure),
+            service_s=None if episodes.service_s is None else by_agent(episodes.service_s),
         )
+
+    @classmethod
+    def of_none(cls, planner: str, params: Params, draws: int) -> "PlannerResult":
+        """Return the result for no agents at all."""
+        lifetime = np.zeros((0, draws), np.int32)
+        if planner == "bound":
+            return cls(lifetime)
+        shares = np.zeros((0, draws, params.n_devices), np.float32)
+        service_s = np.zeros((0, draws), np.float32) if params.end == "horizon" else None
+        return cls(lifetime, np.zeros((0, draws), np.int8), shares, service_s)
+
+    def at(self, rows: Bool[np.ndarray, " A"]) -> "PlannerResult":
+        """Return the result for ``A`` agents, of which only those at ``rows`` were evaluated, with this result."""
+
+        def at_rows(array: np.ndarray) -> np.ndarray:
+            full = np.full((len(rows), *array.shape[1:]), np.nan if array.dtype.kind == "f" else MISSING, array.dtype)
+            full[rows] = array
+            return full
+
+        return replace(self, **{name: at_rows(array) for name, array in vars(self).items() if array is not None})
+
+    @property
+    def mean_lifetime(self) -> Float[np.ndarray, " A"]:
+        """Mean lifetime over the draws, NaN where it was not evaluated."""
+        means = self.lifetime.mean(axis=1)
+        return np.where((self.lifetime == MISSING).any(axis=1), np.nan, means)
 
     def columns(self, planner: str) -> dict[str, Any]:
         """Return the columns of the tidy table that say how episodes end; the bound has none."""
@@ -84,12 +123,17 @@ class PlannerResult:
 
 
 def most_common_cause(causes: Int8[np.ndarray, " D"]) -> str:
-    """Return the name of the most common cause."""
-    return Cause(int(np.bincount(causes).argmax())).name.lower()
+    """Return the name of the most common cause; empty if the episodes were not evaluated."""
+    return "" if (causes == MISSING).any() else Cause(int(np.bincount(causes).argmax())).name.lower()
 
 
-def most_common_first_device(share: Float[np.ndarray, " n"]) -> int:
-    """Return the number (from 1) of the device with the largest share of first failures; 0 if no device ever fails."""
+def most_common_first_device(share: Float[np.ndarray, " n"]) -> int | float:
+    """Return the number (from 1) of the device with the largest share of first failures.
+
+    It is 0 if no device ever fails, and NaN if the shares are not known.
+    """
+    if np.isnan(share).any():
+        return float("nan")
     return int(share.argmax()) + 1 if share.max() > 0 else 0
 
 

@@ -34,8 +34,9 @@ def first_failure_counts(results: Results) -> pd.DataFrame:
     """Count the scenarios in which each device is the first to fail: one row per cell, policy and device.
 
     A scenario (a seed) contributes the share of its held-out episodes in which the device was the first to fail. The counts
-    of a cell add up to its seeds, minus the share of episodes that ended with the UAV's battery. Columns: the axes of the
-    cell, ``policy``, ``device`` (from 1), ``name``, ``weight``, ``high_traffic``, ``count``, ``seeds``.
+    of a cell add up to the seeds for which the policy was evaluated, minus the share of episodes that ended with the UAV's
+    battery. Columns: the axes of the cell, ``policy``, ``device`` (from 1), ``name``, ``weight``, ``high_traffic``,
+    ``count``, ``seeds``.
     """
     rows = []
     agents = with_traffic(results.agents, results.study)
@@ -44,10 +45,11 @@ def first_failure_counts(results: Results) -> pd.DataFrame:
         cell = dict(zip(axes, values, strict=True))
         place = results.run["places"][cell["place"]]
         for policy in policies_and_planners(results):
-            counts = results.first_failures(policy)[group.index].sum(axis=0)
+            shares = results.first_failures(policy)[group.index]
+            counts, seeds = np.nansum(shares, axis=0), int(np.isfinite(shares).all(axis=1).sum())
             for i, count in enumerate(counts):
                 device = {"device": i + 1} | {name: place[name][i] for name in ("name", "weight", "high_traffic")}
-                rows.append(cell | {"policy": policy} | device | {"count": count, "seeds": len(group)})
+                rows.append(cell | {"policy": policy} | device | {"count": count, "seeds": seeds})
     return pd.DataFrame(rows)
 
 

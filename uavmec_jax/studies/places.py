@@ -10,7 +10,7 @@ import numpy as np
 from uavmec_jax.env.layout import Layout, Traffic
 from uavmec_jax.errors import StudyError
 from uavmec_jax.scenarios.places import traffic_weights
-from uavmec_jax.studies.schema import Study
+from uavmec_jax.studies.schema import Study, check_inside
 from uavmec_jax.traffic.evacuation import Evacuation, load_evacuation
 
 
@@ -24,7 +24,7 @@ def load_evacuations(study: Study) -> dict[str, Evacuation]:
 
     Raises:
         TrafficError: a place or its file is not usable, or a hop would take longer than a slot may.
-        StudyError: a place has another number of devices than the study.
+        StudyError: a place has another number of devices than the study, or a depot is outside.
     """
     evacuations = {}
     for name in places_of(study):
@@ -37,6 +37,10 @@ def load_evacuations(study: Study) -> dict[str, Evacuation]:
         lowest_speed = min(study.axes.get("uav_speed_m_s", [study.params.uav_speed_m_s]))
         shortest_cap = min(study.axes.get("slot_cap_s", [study.params.slot_cap_s]))
         evacuation.check_hops(lowest_speed, shortest_cap, study.place_scale_m)
+        try:
+            check_inside(study.depot, evacuation.region_m(study.place_scale_m), f"place {name!r}")
+        except ValueError as error:
+            raise StudyError(f"{study.name}: {error}") from None
         evacuations[name] = evacuation
     return evacuations
 

@@ -6,7 +6,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, Key
+from jaxtyping import Array, Bool, Int, Key
 
 from uavmec_jax.agents.algorithm import Agent
 from uavmec_jax.env.generator import ScenarioDistribution, scenario_from_draw
@@ -16,11 +16,15 @@ from uavmec_jax.env.scenario import Scenario
 from uavmec_jax.planning.fleet_demand import horizon
 from uavmec_jax.planning.parallel import beam_episodes, bound_scenarios, rollout_planner_episodes
 from uavmec_jax.studies.evaluation_result import EvaluationResult, PlannerResult
-from uavmec_jax.studies.schema import Evaluation
+from uavmec_jax.studies.schema import CLAIRVOYANT, Evaluation
 
 
 def evaluate_planners(
-    agents: Agent, keys: Key[Array, "A D"], settings: Evaluation, lifetimes: list[Int[np.ndarray, "A E"]]
+    agents: Agent,
+    keys: Key[Array, "A D"],
+    settings: Evaluation,
+    lifetimes: list[Int[np.ndarray, "A E"]],
+    clairvoyant: Bool[np.ndarray, " A"] | None = None,
 ) -> dict[str, PlannerResult]:
     """Evaluate the planners and the bound on the first held-out draws.
 
@@ -29,21 +33,43 @@ def evaluate_planners(
         keys: held-out draws.
         settings: which planners, on how many draws, and how wide they search.
         lifetimes: lifetimes of policies on these draws and any more behind them; the bound cannot be below them.
+        clairvoyant: agents that beam and bound are evaluated for; ``None``: all.
     """
     draws = min(settings.planner_draws, keys.shape[1])
-    shape = (keys.shape[0], draws)
-    params, layouts, keys = flatten_draws(agents.scenario, keys[:, :draws])
-    slots = horizon(params, layouts)
-    results = {}
+    keys = keys[:, :draws]
+    results: dict[str, PlannerResult] = {}
     if "rollout" in settings.planners:
-        _, episodes = rollout_planner_episodes(params, layouts, keys, slots=slots, samples=settings.rollout_samples)
-        results["rollout"] = PlannerResult.of(episodes, shape)
+        params, layouts, flat = flatten_draws(agents.scenario, keys)
+        slots, samples = horizon(params, layouts), settings.rollout_samples
+        _, episodes = rollout_planner_episodes(params, layouts, flat, slots=slots, samples=samples)
+        results["rollout"] = PlannerResult.of(episodes, draws)
+    reached = [lifetime[:, :draws] for lifetime in (*lifetimes, *(result.lifetime for result in results.values()))]
+    if clairvoyant is None or clairvoyant.all():
+        return results | _evaluate_clairvoyant(agents, keys, settings, reached)
+    if clairvoyant.any():
+        agents, keys = jax.tree.map(lambda leaf: leaf[clairvoyant], (agents, keys))
+        found = _evaluate_clairvoyant(agents, keys, settings, [lifetime[clairvoyant] for lifetime in reached])
+    else:
+        found = {name: PlannerResult.of_none(name, agents.scenario.params, draws) for name in CLAIRVOYANT}
+    return results | {name: found[name].at(clairvoyant) for name in settings.planners if name in found}
+
+
+def _evaluate_clairvoyant(
+    agents: Agent, keys: Key[Array, "A P"], settings: Evaluation, reached: list[Int[np.ndarray, "A P"]]
+) -> dict[str, PlannerResult]:
+    """Evaluate the beam and the bound, which is not below the lifetimes that policies ``reached``."""
+    results: dict[str, PlannerResult] = {}
+    if not set(CLAIRVOYANT) & set(settings.planners):
+        return results
+    shape = keys.shape
+    params, layouts, keys = flatten_draws(agents.scenario, keys)
+    slots = horizon(params, layouts)
     if "beam" in settings.planners:
         _, episodes = beam_episodes(params, layouts, keys, slots=slots, width=settings.beam_width)
-        results["beam"] = PlannerResult.of(episodes, shape)
+        results["beam"] = PlannerResult.of(episodes, shape[1])
+        reached = [*reached, results["beam"].lifetime]
     if "bound" in settings.planners:
-        reached = [*lifetimes, *(result.lifetime for result in results.values())]
-        at_least = np.max([np.ones(shape), *(lifetime[:, :draws] for lifetime in reached)], axis=0)
+        at_least = np.max([np.ones(shape), *reached], axis=0)
         bounds = bound_scenarios(params, layouts, keys, at_least.reshape(-1), slots=slots)
         results["bound"] = PlannerResult(lifetime=bounds.reshape(shape))
     return results
@@ -61,11 +87,10 @@ def planner_columns(
     if not planner_results:
         return {}
     draws = next(iter(planner_results.values())).lifetime.shape[1]
-    lifetimes = {name: result.lifetime for name, result in results.items()}
-    lifetimes |= {name: result.lifetime for name, result in planner_results.items()}
     columns: dict[str, np.ndarray | list] = {
-        f"{name.replace('-', '_')}_planned": lifetime[:, :draws].mean(axis=1) for name, lifetime in lifetimes.items()
+        f"{name.replace('-', '_')}_planned": result.lifetime[:, :draws].mean(axis=1) for name, result in results.items()
     }
+    columns |= {f"{name}_planned": result.mean_lifetime for name, result in planner_results.items()}
     for name, result in planner_results.items():
         columns |= result.columns(name)
     return columns

@@ -14,13 +14,17 @@ from jaxtyping import Array, Int, Key
 
 from uavmec_jax.agents.algorithm import Agent, Algorithm
 from uavmec_jax.agents.registry import ALGORITHMS
+from uavmec_jax.env.fleet import make_fleet
 from uavmec_jax.env.generator import ScenarioDistribution
+from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params, leaf_dtype
 from uavmec_jax.env.rewards import Reward, make_reward, needs_guard
 from uavmec_jax.env.scenario import Scenario
 from uavmec_jax.scenarios.distribution import make_distribution
+from uavmec_jax.scenarios.inventory import depots_of
 from uavmec_jax.scenarios.seeds import Stream, identity_keys, layout_for_seed
 from uavmec_jax.studies.axes import TRAFFIC_WEIGHTS
+from uavmec_jax.studies.parts import split_study
 from uavmec_jax.studies.places import move_to_places
 from uavmec_jax.studies.schema import Study
 
@@ -34,33 +38,28 @@ def seeds_of(study: Study) -> list[int]:
     return list(range(seeds)) if isinstance(seeds, int) else list(seeds)
 
 
+def clairvoyant_seeds(study: Study) -> list[int]:
+    """Return the seeds that beam and bound are evaluated on, of one part of a study."""
+    numbers, seeds = study.evaluation.clairvoyant_seeds, seeds_of(study)
+    return seeds if numbers is None else seeds[: numbers[min(study.uavs, len(numbers)) - 1]]
+
+
 def cell_axes(study: Study) -> list[str]:
     """Return the axes of a cell, which are all but the seeds; ``powered`` and ``connected``, or ``scenarios``, come first."""
     others = [name for name in study.axes if name not in ("powered", "connected", "cells", "seeds")]
     return [*(("scenarios",) if study.scenarios else ("powered", "connected")), *others]
 
 
-def split_by_algorithm(study: Study) -> list[Study]:
-    """Split a study into studies of one algorithm each, in the order in which they run."""
-    if "algorithm" not in study.axes:
-        return [study]
-    axes = {name: values for name, values in study.axes.items() if name != "algorithm"}
-    return [study.model_copy(update={"algorithm": name, "axes": axes}) for name in study.axes["algorithm"]]
-
-
 def make_agent_ids(study: Study) -> list[AgentId]:
     """Return the identities of all agents.
 
-    Algorithms are outermost, then come the seeds, so that the first shards hold whole grids. A reward without ``log A`` and
-    ``log O`` is the same under every guard; it occurs once, under the first.
+    The axes of :data:`PART_AXES` are outermost, then come the seeds, so that the first shards hold whole grids. A reward
+    without ``log A`` and ``log O`` is the same under every guard; it occurs once, under the first.
     """
-    if "algorithm" in study.axes:
+    parts = split_study(study)
+    if parts[0].values:
         order = ["seed", *cell_axes(study)]
-        agent_ids = [
-            agent_id | {"algorithm": part.algorithm}
-            for part in split_by_algorithm(study)
-            for agent_id in make_agent_ids(part)
-        ]
+        agent_ids = [agent_id | part.values for part in parts for agent_id in make_agent_ids(part.study)]
         return [{name: agent_id[name] for name in order} for agent_id in agent_ids]
     others = [name for name in cell_axes(study) if name in study.axes and name not in ("powered", "connected")]
     axes: list[Iterable[Any]] = [seeds_of(study), _cells(study), *(study.axes[name] for name in others)]
@@ -113,23 +112,21 @@ def make_agents(study: Study, reward: Reward | None = None, agent_ids: list[Agen
 
     The randomness of an agent depends on its seed and its numbers of powered and connected devices alone: the layout on the
     seed (the cells of a seed have the same devices, fewer of them with power or communication), exploration and initial
-    weights on all three. Hyperparameters, rewards and algorithms are thus compared under the same randomness.
+    weights on all three. Hyperparameters, rewards, algorithms and fleets are thus compared under the same randomness.
 
     Args:
-        study: a study of one algorithm, or one that trains nothing.
+        study: one part of a study, see :func:`split_study`.
         reward: replaces the study's reward, for all agents.
         agent_ids: identities of the agents; by default all of the study, in the order of :func:`make_agent_ids`.
     """
     agent_ids = make_agent_ids(study) if agent_ids is None else agent_ids
     seeds, powered, connected = (_column(agent_ids, name) for name in ("seed", "powered", "connected"))
     params = Params(**{name: _stack(agent_ids, name, value) for name, value in study.params.model_dump().items()})
-    rewards = jax.tree.map(
-        lambda *leaves: jnp.stack(leaves), *(_reward_of(study, agent_id, reward) for agent_id in agent_ids)
-    )
+    rewards = _stack_rewards([_reward_of(study, agent_id, reward) for agent_id in agent_ids])
     scenario: Scenario | ScenarioDistribution
     if study.scenarios is None:
-        layout = move_to_places(_layouts_for_seeds(seeds, params, powered, connected), agent_ids, study)
-        scenario = Scenario(params=params, layout=layout, reward=rewards)
+        layouts = move_to_places(_layouts_for_seeds(seeds, params, powered, connected), agent_ids, study)
+        scenario = Scenario(params=params, layout=_add_fleets(layouts, params, study), reward=rewards)
     else:
         scenario = make_distribution(study.scenarios, params, rewards, len(agent_ids))
     algorithm = "dqn" if study.algorithm == "none" else study.algorithm  # "none" uses no hyperparameters
@@ -147,7 +144,7 @@ def _stack(agent_ids: list[AgentId], name: str, default: Any) -> Any:
     """Return the values of a setting for all agents: leaves ``[A]``; a static setting as it is."""
     if isinstance(default, tuple):
         return tuple(jnp.full(len(agent_ids), number, jnp.float32) for number in default)
-    if name == "n_devices":
+    if name == "n_devices" or isinstance(default, str):
         return default
     return jnp.asarray([agent_id.get(name, default) for agent_id in agent_ids], leaf_dtype(default))
 
@@ -158,6 +155,25 @@ def _reward_of(study: Study, agent_id: AgentId, reward: Reward | None) -> Reward
         reward = make_reward(agent_id.get("reward", study.reward), agent_id.get("guard", study.guard))
     traffic = {name: jnp.float32(agent_id.get(name, getattr(study, name))) for name in TRAFFIC_WEIGHTS}
     return replace(reward, per_slot=jnp.float32(study.slot_reward), **traffic)
+
+
+def _stack_rewards(rewards: list[Reward]) -> Reward:
+    """Return rewards as one, leaves ``[A, ...]``; where only some have the term of service, the others weigh it by 0."""
+    if any(reward.service is not None for reward in rewards):
+        rewards = [replace(reward, service=jnp.float32(reward.service or 0.0)) for reward in rewards]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *rewards)
+
+
+def _add_fleets(layouts: Layout, params: Params, study: Study) -> Layout:
+    """Give agents' layouts, leaves ``[A, ...]``, the UAVs and the depots of a part; one UAV without depots is no fleet."""
+    position = np.array([(depot.x_m, depot.y_m) for depot in study.depots_there]).reshape(-1, 2)
+    depots = depots_of(study.depots_there, position)
+    if study.uavs == 1 and depots is None:
+        return layouts
+    fleets = jax.vmap(lambda params: make_fleet(params, study.uavs, depots))(params)
+    agents = layouts.capacity.shape[0]
+    depots = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (agents, *leaf.shape)), depots)
+    return replace(layouts, fleet=fleets, depots=depots)
 
 
 _layouts_for_seeds = jax.jit(jax.vmap(layout_for_seed))

@@ -15,7 +15,10 @@ from jaxtyping import Float
 
 from uavmec_jax.files.writing import write_arrays, write_text
 from uavmec_jax.scenarios.policy_files import WEIGHTS, PolicyCollection, write_policies
-from uavmec_jax.studies.evaluation_result import most_common_first_device
+from uavmec_jax.scenarios.settings import unused_params
+from uavmec_jax.studies.evaluation_result import MISSING, most_common_first_device
+from uavmec_jax.studies.measures import with_measures
+from uavmec_jax.studies.parts import split_study
 from uavmec_jax.studies.population import cell_axes
 from uavmec_jax.studies.schema import PLANNERS, Study
 from uavmec_jax.studies.shard_result import ShardResult
@@ -38,8 +41,9 @@ class Results:
         agents: tidy table, one row per finished agent.
         curves: per algorithm, of its agents: ``chunk_steps [C]``, ``episode_length [A, C]``, ``validation_steps [V]``,
             ``validation [A, V]``.
-        evaluation: per policy ``<name>/lifetime [A, E]``, ``/cause [A, E]``, ``/first_failure [A, E, n]``, the fixed draw
-            last; per planner the same with ``P`` held-out draws in place of ``E``, of the bound the lifetimes only.
+        evaluation: per policy ``<name>/lifetime [A, E]``, ``/cause [A, E]``, ``/first_failure [A, E, n]``, with a horizon
+            ``/service_s [A, E]``, the fixed draw last; per planner the same with ``P`` held-out draws in place of ``E``, of
+            the bound the lifetimes only. Planners that were not evaluated for an agent have :data:`MISSING` and NaN.
         weights: ``<algorithm>/best/...`` and ``<algorithm>/last/...``, leaves ``[A, ...]`` of its agents; empty when
             read back by :func:`load_results`.
     """
@@ -65,8 +69,13 @@ class Results:
     @property
     def gaps(self) -> list[tuple[str, str]]:
         """Pairs ``(upper, lower)`` of neighbours in the order: shown policy, planners, upper bound."""
-        ladder = [name for name in (self.shown, *PLANNERS) if f"{name}_planned" in self.agents]
-        return list(zip(ladder[1:], ladder, strict=False))
+        return list(zip(self.ladder[1:], self.ladder, strict=False))
+
+    @property
+    def ladder(self) -> list[str]:
+        """The shown policy, planners and upper bound, as far as some agent was evaluated on the planners' draws."""
+        columns = {name: f"{name}_planned" for name in (self.shown, *PLANNERS)}
+        return [name for name, column in columns.items() if column in self.agents and self.agents[column].notna().any()]
 
     @classmethod
     def of(cls, study: Study, label: Mapping[str, Any], shards: Iterable[ShardResult], agents: int) -> "Results":
@@ -93,9 +102,10 @@ class Results:
             steps += shard.steps
             for activity, spent in shard.seconds.items():
                 seconds[activity] = seconds.get(activity, 0.0) + spent
-        results.agents = pd.concat(rows, ignore_index=True) if rows else pd.DataFrame()
         results.curves = {name: _concatenate(pieces) for name, pieces in curves.items()}
         results.evaluation, results.weights = _concatenate(evaluation), _concatenate(weights)
+        if rows:
+            results.agents = with_measures(study, pd.concat(rows, ignore_index=True), results.evaluation)
         results._add_totals(agents, steps, seconds)
         return results
 
@@ -116,6 +126,18 @@ class Results:
                 "checkpoint_share": round(seconds.get("checkpoint", 0.0) / seconds["train"], 4),
             }
 
+    def parts(self) -> dict[str, "Results"]:
+        """Return the results of each part of the study, see :class:`Part`, by its name, without curves and weights."""
+        parts = {}
+        for part in split_study(self.study):
+            there = np.ones(len(self.agents), bool)
+            for axis, value in part.values.items():
+                there &= (self.agents[axis] == value).to_numpy(bool)
+            agents = self.agents[there].drop(columns=list(part.values)).reset_index(drop=True)
+            evaluation = {name: array[there] for name, array in self.evaluation.items()}
+            parts[part.name] = Results(part.study, self.run, agents=agents, evaluation=evaluation)
+        return parts
+
     def cells(self) -> pd.DataFrame:
         """Return one row per cell: means and intervals over seeds, paired differences, and the device that fails first."""
         axes = cell_axes(self.study)
@@ -123,6 +145,11 @@ class Results:
             dict(zip(axes, cell, strict=True)) | {"seeds": len(group)} | self._cell(group)
             for cell, group in self.agents.groupby(axes, sort=False)
         )
+
+    def agents_of(self, cell: Any) -> pd.DataFrame:
+        """Return the agents of a cell, which is a row of :meth:`cells`."""
+        axes = cell_axes(self.study)
+        return self.agents[np.logical_and.reduce([self.agents[axis] == cell[axis] for axis in axes])]
 
     def _cell(self, agents: pd.DataFrame) -> dict[str, Any]:
         """Return the row of one cell without its axes."""
@@ -139,11 +166,14 @@ class Results:
         for name in agents.columns[agents.columns.str.endswith("_planned")]:
             row[name] = float(agents[name].mean())
         for planner in (name for name in PLANNERS if f"{name}/first_failure" in self.evaluation):
-            share = self.evaluation[f"{planner}/first_failure"][agents.index].mean(axis=(0, 1))
-            row |= _first_failure_columns(planner, share)
+            shares = self.evaluation[f"{planner}/first_failure"][agents.index]
+            evaluated = shares[~np.isnan(shares).any(axis=(1, 2))]
+            row |= _first_failure_columns(planner, evaluated.mean(axis=(0, 1)) if len(evaluated) else shares[0, 0])
         for upper, lower in self.gaps:
             difference = agents[f"{upper}_planned"] - agents[f"{lower}_planned"]
             row |= _interval_columns(f"{upper}_over_{lower}", difference)
+        for name in agents.columns[agents.columns.str.endswith(("_service", "_censored"))]:
+            row[name] = float(agents[name].mean())
         return row
 
     def curve_table(self) -> pd.DataFrame:
@@ -163,7 +193,8 @@ class Results:
     def episode_table(self) -> pd.DataFrame:
         """Return all episodes as a tidy table: the agent's axes, ``policy``, ``draw``, ``fixed`` and ``lifetime`` (slots).
 
-        ``fixed`` says whether the draw is the one that is the same for every agent.
+        ``fixed`` says whether the draw is the one that is the same for every agent. Episodes that were not evaluated are
+        left out.
         """
         agents, tables = self._agent_axes(slice(None)), []
         for name, lifetimes in self.evaluation.items():
@@ -174,7 +205,8 @@ class Results:
             draw = np.tile(np.arange(draws), len(agents))
             fixed = (draw == draws - 1) & (policy not in PLANNERS)
             table = _repeat_rows(agents, draws)
-            tables.append(table.assign(policy=policy, draw=draw, fixed=fixed, lifetime=lifetimes.ravel()))
+            table = table.assign(policy=policy, draw=draw, fixed=fixed, lifetime=lifetimes.ravel())
+            tables.append(table[table["lifetime"] != MISSING])
         return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
     def _agent_axes(self, which: Any) -> pd.DataFrame:
@@ -184,7 +216,8 @@ class Results:
     def first_failures(self, policy: str) -> Float[np.ndarray, "A n"]:
         """Return each agent's share of held-out episodes in which each device is the first to fail.
 
-        A planner's episodes are its first few held-out draws; a policy's are all of them, followed by the fixed draw.
+        A planner's episodes are its first few held-out draws; a policy's are all of them, followed by the fixed draw. Agents
+        for which a planner was not evaluated have NaN.
         """
         episodes = self.evaluation[f"{policy}/first_failure"]
         return np.asarray((episodes if policy in PLANNERS else episodes[:, :-1]).mean(axis=1))
@@ -232,8 +265,10 @@ def _repeat_rows(table: pd.DataFrame, times: int) -> pd.DataFrame:
 
 
 def _interval_columns(name: str, values: pd.Series) -> dict[str, float]:
-    """Return a mean with its 95 % interval as columns."""
-    return dict(zip((name, f"{name}_low", f"{name}_high"), mean_interval(values.to_numpy()), strict=True))
+    """Return a mean with its 95 % interval as columns; values that are missing are left out."""
+    known = values.dropna().to_numpy()
+    interval = mean_interval(known) if len(known) else (math.nan,) * 3
+    return dict(zip((name, f"{name}_low", f"{name}_high"), interval, strict=True))
 
 
 def _first_failure_columns(policy: str, share: Float[np.ndarray, " n"]) -> dict[str, Any]:
@@ -245,7 +280,8 @@ def _drawn(study: Study) -> dict[str, Any]:
     """Return the settings that scenarios are drawn from, for JSON; infinite numbers, which it lacks, are left out."""
     if study.scenarios is None:
         return {}
-    params = {name: value for name, value in study.params.model_dump().items() if value != math.inf}
+    settings = study.params.model_dump(exclude=unused_params(study.params))
+    params = {name: value for name, value in settings.items() if value != math.inf}
     return {"scenarios": study.scenarios.model_dump(mode="json"), "params": params}
 
 

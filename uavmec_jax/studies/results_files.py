@@ -15,6 +15,9 @@ from uavmec_jax.scenarios.policy_files import WEIGHTS, read_policies
 from uavmec_jax.studies.results import AGENTS, CURVES, EVALUATION, RUN, SCHEMA, STUDY, Results
 from uavmec_jax.studies.study import load_study
 
+_MAY_BE_MISSING = ("_planned", "_first_device", "_first_share", "_service", "_censored")
+"""Ends of the names of columns of numbers that not every agent has."""
+
 
 def read_results(directory: Path) -> Results:
     """Read the results of a finished run, without its weights (see :func:`load_weights`).
@@ -57,9 +60,14 @@ def _check_digests(directory: Path, run: dict[str, Any]) -> None:
 
 
 def _read_table(path: Path) -> pd.DataFrame:
-    """Read the tidy table; lists of device numbers stay text, also if they are empty or have one number."""
-    lists = {name: str for name in pd.read_csv(path, nrows=0).columns if name.endswith("_devices_fixed")}
-    return pd.read_csv(path, dtype=lists, keep_default_na=False)
+    """Read the tidy table; lists of device numbers stay text, also if they are empty or have one number.
+
+    Numbers are missing (NaN) for agents for which a planner was not evaluated.
+    """
+    columns = pd.read_csv(path, nrows=0).columns
+    lists = {name: str for name in columns if name.endswith("_devices_fixed")}
+    missing = {name: [""] for name in columns if name.endswith(_MAY_BE_MISSING)}
+    return pd.read_csv(path, dtype=lists, keep_default_na=False, na_values=missing)
 
 
 def load_weights(directory: str | Path, which: str = "best", algorithm: str | None = None) -> dict[str, Any]:

@@ -4,20 +4,24 @@ The numbers of Table 1 and the hyperparameters are declared once (:class:`Params
 made from those declarations.
 """
 
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal, get_args
 
 import pydantic
 from pydantic import Field
 
 from uavmec_jax.agents.registry import ALGORITHMS, SCENARIO_SETTINGS
+from uavmec_jax.env.fleet import MAX_UAVS
 from uavmec_jax.env.rewards import DEFAULT_REWARD, LOG_GUARDS
 from uavmec_jax.files.validation import StrictModel, from_array, model_from_dataclasses
 from uavmec_jax.planning.beam import WIDTH as BEAM_WIDTH
-from uavmec_jax.planning.heuristics import HEURISTICS
+from uavmec_jax.planning.heuristics import FLEET_HEURISTICS, HEURISTICS
 from uavmec_jax.planning.rollout_planner import SAMPLES as ROLLOUT_SAMPLES
 from uavmec_jax.scenarios.distribution import ScenarioSettings, check_scenarios
+from uavmec_jax.scenarios.inventory import check_depots
+from uavmec_jax.scenarios.schema import DepotSettings, label
 from uavmec_jax.scenarios.settings import ParamsSettings, check_ranges
-from uavmec_jax.studies.axes import TRAFFIC_WEIGHTS, check_axes, check_reward
+from uavmec_jax.studies.axes import TRAFFIC_WEIGHTS, check_axes, check_reward, expected_depots
 
 
 def _algorithm_settings(name: str) -> Any:
@@ -34,11 +38,14 @@ A2CSettings: Any = _algorithm_settings("a2c")
 
 AlgorithmName: Any = Literal[(*ALGORITHMS, "none")]
 Guard: Any = Literal[LOG_GUARDS]
-Heuristic: Any = Literal[tuple(HEURISTICS)]
+Heuristic: Any = Literal[tuple(FLEET_HEURISTICS)]
 
 Planner = Literal["rollout", "beam", "bound"]
 PLANNERS: tuple[Planner, ...] = get_args(Planner)
 """In the order of their lifetimes: without knowledge of the future, clairvoyant, and the upper bound on every policy."""
+
+CLAIRVOYANT: tuple[Planner, ...] = ("beam", "bound")
+"""Those that know the volumes in advance."""
 
 
 class Evaluation(StrictModel):
@@ -55,8 +62,18 @@ class Evaluation(StrictModel):
     """Planners and the bound, which show how far policies are from the optimum; see ``docs/planning.md``."""
     planner_draws: Annotated[int, Field(ge=1, le=10_000)] = 8
     """Number of held-out draws, from the first on, that planners are evaluated on (all of them if there are fewer)."""
+    clairvoyant_seeds: Annotated[tuple[Annotated[int, Field(ge=0)], ...] | None, from_array] = None
+    """Numbers of seeds, from the first on, that beam and bound are evaluated on, which take longest: that for one UAV, for
+    two, and so on; the last number holds for more UAVs. By default, all seeds."""
     rollout_samples: Annotated[int, Field(ge=1, le=1000)] = ROLLOUT_SAMPLES
     beam_width: Annotated[int, Field(ge=1, le=100_000)] = BEAM_WIDTH
+
+
+class StudyDepot(DepotSettings):
+    """One depot of a study."""
+
+    x_m: float
+    y_m: float
 
 
 class Study(StrictModel):
@@ -84,9 +101,15 @@ class Study(StrictModel):
     """Added to the reward for every slot that counts toward the lifetime."""
     scenarios: ScenarioSettings | None = None
     """Distribution from which every episode draws a scenario; it replaces the axes ``powered`` and ``connected``."""
+    uavs: Annotated[int, Field(ge=1, le=MAX_UAVS)] = 1
+    """Number of UAVs, all like that of ``params``."""
+    depot: Annotated[tuple[StudyDepot, ...], from_array] = ()
+    """Where UAVs swap or charge their batteries."""
+    depots: Annotated[int, Field(ge=0)] | None = None
+    """How many of the tables ``depot`` are there, the first ones; by default all of them."""
     axes: dict[str, Any]
     """``powered`` and ``connected``, or ``cells`` (pairs of the two); ``seeds`` (a number or a list); ``algorithm``,
-    ``reward``, ``guard``, ``place``, ``traffic_bonus``, ``traffic_penalty``, or any traced setting."""
+    ``reward``, ``guard``, ``place``, ``traffic_bonus``, ``traffic_penalty``, ``uavs``, ``depots``, or any traced setting."""
     dqn: DQNSettings = DQNSettings()
     ppo: PPOSettings = PPOSettings()
     a2c: A2CSettings = A2CSettings()
@@ -101,6 +124,11 @@ class Study(StrictModel):
         names = self.axes.get("algorithm", [self.algorithm])
         return tuple(name for name in ALGORITHMS if isinstance(names, list) and name in names)
 
+    @property
+    def depots_there(self) -> tuple[StudyDepot, ...]:
+        """The depots of a study without the axis ``depots``."""
+        return self.depot[: self.depots]
+
     @pydantic.model_validator(mode="after")
     def _check(self) -> "Study":
         check_reward("reward", self.reward)
@@ -108,6 +136,8 @@ class Study(StrictModel):
         _check_traffic(self)
         check_ranges(self.params, "params.")
         _check_drawn(self)
+        _check_fleets(self)
+        _check_horizon(self)
         _check_algorithms(self)
         if self.algorithm == "none" and not self.evaluation.baselines + self.evaluation.planners:
             raise ValueError(
@@ -137,6 +167,62 @@ def _check_traffic(study: Study) -> None:
     for name in (*TRAFFIC_WEIGHTS, "place_scale_m"):
         if getattr(study, name) or name in study.axes:
             raise ValueError(f"{name} is given, but no place; give place, e.g. place = 'albany'")
+
+
+def check_inside(depots: Sequence[StudyDepot], region_m: tuple[float, float], region: str) -> None:
+    """Check that every depot is inside a region.
+
+    Raises:
+        ValueError: one line that names the depot and the ``region``.
+    """
+    for number, depot in enumerate(depots, 1):
+        position = (depot.x_m, depot.y_m)
+        if not all(0 <= at <= side for at, side in zip(position, region_m, strict=True)):
+            sides = " x ".join(f"{side:.0f}" for side in region_m)
+            raise ValueError(
+                f"{label('depot', number, depot.name)}: is at {list(position)}, outside {region}, {sides} m; "
+                "give x_m and y_m inside it"
+            )
+
+
+def _check_fleets(study: Study) -> None:
+    """Check the depots, and that nothing but evaluation is asked of fleets."""
+    if study.depots is not None and study.depots > len(study.depot):
+        raise ValueError(f"depots is {study.depots}; {expected_depots(study)}")
+    if study.evaluation.clairvoyant_seeds == ():
+        raise ValueError("evaluation.clairvoyant_seeds is empty; give a number for one UAV, for two, and so on")
+    if study.evaluation.clairvoyant_seeds is not None and study.scenarios is not None:
+        raise ValueError(
+            "evaluation.clairvoyant_seeds is given, and scenarios too, whose seeds share them; leave it out"
+        )
+    check_depots(study.depot)
+    if not (study.place or "place" in study.axes):
+        check_inside(study.depot, study.params.region_m, "params.region_m")
+    there = study.axes.get("depots", [len(study.depots_there)])
+    for name, values, least in (("uavs", study.axes.get("uavs", [study.uavs]), 1), ("depots", there, 0)):
+        if max(values) == least:
+            continue
+        where = f"axes.{name} has" if name in study.axes else f"{name} is"
+        if study.scenarios is not None:
+            raise ValueError(
+                f"{where} {max(values)}, and scenarios are given, which have one UAV; leave one of them out"
+            )
+        if study.algorithms:
+            algorithm = study.algorithms[0]
+            raise ValueError(
+                f"{where} {max(values)}, and algorithm is {algorithm!r}, which trains for one UAV without depots; "
+                "set algorithm = 'none'"
+            )
+
+
+def _check_horizon(study: Study) -> None:
+    """Check that planners which know nothing but lifetimes are not asked about episodes that no failure ends."""
+    asked = [name for name in study.evaluation.planners if name in CLAIRVOYANT]
+    if study.params.end == "horizon" and asked:
+        raise ValueError(
+            f"evaluation.planners has {asked[0]!r}, which is about the first failure, and params.end is 'horizon'; give "
+            "planners = ['rollout'] or []"
+        )
 
 
 def _check_algorithms(study: Study) -> None:

@@ -12,6 +12,7 @@ from uavmec_jax.agents.registry import ALGORITHMS
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files.reading import parse_toml, read_text
 from uavmec_jax.files.validation import describe_error, suggest
+from uavmec_jax.scenarios.settings import unused_params
 from uavmec_jax.studies.schema import Study
 
 _LIBRARY = resources.files("uavmec_jax.studies") / "library"
@@ -69,10 +70,13 @@ def parse_study(text: str, source: str, overrides: Mapping[str, Any] | None = No
     try:
         return Study.model_validate(data)
     except pydantic.ValidationError as error:
-        raise StudyError(describe_error(source, error, Study)) from None
+        raise StudyError(describe_error(source, error, Study, data)) from None
 
 
 def study_toml(study: Study) -> str:
     """Return the text of a study file with every setting resolved, from which an equal study is read back."""
-    unused = set(ALGORITHMS) - set(study.algorithms)
+    unused: dict[str, Any] = dict.fromkeys(set(ALGORITHMS) - set(study.algorithms), True)
+    unused["params"] = unused_params(study.params)
+    # Settings of fleets are left out where there is none, so that the files of other studies stay as they were.
+    unused |= {name: True for name, default in (("uavs", 1), ("depot", ())) if getattr(study, name) == default}
     return tomli_w.dumps(study.model_dump(exclude=unused, exclude_none=True))

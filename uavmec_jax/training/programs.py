@@ -62,15 +62,16 @@ class Programs:
     def compile(cls, algorithm: Algorithm, mesh: Mesh, example: tuple[Agent, Key[Array, "B D"]]) -> "Programs":
         """Compile the programs for the shapes of an example: agents and the keys of their validations."""
         split, shared = PartitionSpec(AGENTS_AXIS), PartitionSpec()
+        sharding = NamedSharding(mesh, split)
 
         def over_agents(function: Callable, n_split: int, n_shared: int = 0, **jit: Any) -> Any:
             batched = jax.vmap(function, (0,) * n_split + (None,) * n_shared, axis_name=AGENTS_AXIS)
             specs = (split,) * n_split + (shared,) * n_shared
             # check_vma: the branch in `update` is decided on each device, which the checker cannot express.
             mapped = jax.shard_map(batched, mesh=mesh, in_specs=specs, out_specs=split, check_vma=False)
-            return jax.jit(mapped, **jit)
+            # out_shardings: XLA would replicate empty leaves, such as the packs of no depots.
+            return jax.jit(mapped, out_shardings=sharding, **jit)
 
-        sharding = NamedSharding(mesh, split)
         struct_of = lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)  # noqa: E731
         agents, keys = jax.tree.map(struct_of, example)
         init = over_agents(algorithm.init, 1)
