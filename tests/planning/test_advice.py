@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from tests.hamlet import hamlet
 from tests.small_scenarios import mid_life
 from uavmec_jax.env.dynamics import initial_state
+from uavmec_jax.env.fleet import make_fleet
 from uavmec_jax.env.layout import Traffic
 from uavmec_jax.env.rollout import rollouts
 from uavmec_jax.planning import advice as advice_module
@@ -71,7 +73,7 @@ def test_what_if_has_every_repair_and_removal(scenario, advice):
 def test_advising_again_compiles_nothing(scenario):
     """One compilation serves every state, layout and setting of the same sizes."""
     params, layout, state = scenario
-    jitted = (advice_module._try_candidates, advice_module._lifetimes)
+    jitted = (advice_module._try_candidates, advice_module._play_layouts)
     advise(POLICY, params, layout, state, samples=4, what_if=True)
     compiled = [function._cache_size() for function in jitted]
     other_params, other_layout, other_state = mid_life(6, 6, uav_speed_m_s=8.0)
@@ -139,3 +141,38 @@ def test_the_price_of_a_failure_counts(scenario):
     ]
     assert value[1] >= value[0] - 1e-3
     assert all(candidate.behind >= -1e-3 for candidate in priced.candidates)
+
+
+@pytest.mark.slow
+def test_until_a_horizon_places_are_compared_by_service():
+    scenario = hamlet()
+    state = scenario.state.replace(elapsed=jnp.float32(1200.0), slot=jnp.int32(2))
+    advice = advise(POLICY, scenario.params, scenario.layout, state, samples=8, what_if=True)
+    for uav in advice.uavs:
+        best = uav.candidates[0]
+        for candidate in uav.candidates:
+            assert 0 <= candidate.service <= 1
+            assert_allclose(candidate.behind, best.service - candidate.service, atol=1e-6)
+    assert_allclose(advice.forecast.service_s.mean() / 2400, advice.uavs[-1].candidates[0].service, rtol=1e-5)
+    assert np.isnan(advice.forecast.failure_slot).all()
+    assert advice.what_if[0].service is not None
+
+
+def leave_in_turn(params, layout, state, key=None):
+    """UAV 0 flies to the depot at once, UAV 1 in the third slot, UAV 2 never."""
+    return jnp.where(state.slot >= jnp.array([0, 2, 99]), 3, jnp.arange(3)).astype(jnp.int32)
+
+
+@pytest.mark.slow
+def test_returns_to_a_depot():
+    """Nothing can fail, so that the policy's own choices are taken."""
+    layout, params = hamlet("first_failure").layout, hamlet("first_failure").params.replace(max_slots=5)
+    layout = layout.replace(
+        has_power=jnp.ones(3, bool), has_comms=jnp.ones(3, bool), fleet=make_fleet(params, 3, layout.depots)
+    )
+    first, second, third = advise(leave_in_turn, params, layout, samples=4).uavs
+    assert [first.returns_in, first.returns_in_s] == [0, 0]
+    assert second.returns_in == 2
+    assert 0 < second.returns_in_s <= 1200
+    assert np.isnan(third.returns_in)
+    assert np.isnan(third.returns_in_s)

@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose
 from PIL import Image
 
 from tests.traffic.networks import evacuation
+from uavmec_jax.env.fleet import make_fleet
 from uavmec_jax.env.layout import sample_layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.planning.heuristics import HEURISTICS
@@ -61,3 +62,14 @@ def test_animation_has_a_frame_for_each_slot(tmp_path):
         assert image.is_animated
         assert slots <= image.n_frames <= slots + 4  # the last frame is held; equal frames are kept as one
     assert [file.name for file in tmp_path.iterdir()] == ["evacuation.gif"]
+
+
+@pytest.mark.slow
+def test_animation_of_a_fleet(tmp_path):
+    place, params = evacuation(), Params(n_devices=3, end="horizon", horizon_s=1200.0)
+    layout = on_place(sample_layout(jax.random.key(0), params, 1, 1), place, moving=True)
+    layout = layout.replace(fleet=make_fleet(params, 2))
+    path = tmp_path / "evacuation.gif"
+    slots = save_animation(path, place, params, layout, HEURISTICS["oldest-first"], jax.random.key(1), "hamlet")
+    with Image.open(path) as image:
+        assert slots <= image.n_frames <= slots + 4

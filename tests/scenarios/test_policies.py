@@ -17,7 +17,7 @@ from tests.runs.test_run import TOML as TINY
 from uavmec_jax.agents import dqn, ppo
 from uavmec_jax.env.observation import observe
 from uavmec_jax.errors import PolicyError
-from uavmec_jax.planning.heuristics import HEURISTICS
+from uavmec_jax.planning.heuristics import FLEET_HEURISTICS, HEURISTICS
 from uavmec_jax.runs.run import run_study
 from uavmec_jax.scenarios.policies import TrainedPolicy, load_policy
 from uavmec_jax.scenarios.policy_files import PolicyCollection, read_policies, write_policies
@@ -222,3 +222,29 @@ def test_damaged_and_foreign_files_are_refused(run, tmp_path):
         load_policy(path)
     with pytest.raises(PolicyError, match=r"none\.npz: cannot be read"):
         load_policy(tmp_path / "none.npz")
+
+
+def test_a_trained_policy_lifted_to_a_fleet(run):
+    """One UAV with a depot and three UAVs decide by the policy; without any depot, the first one does as if it were alone."""
+    policy = load_policy(run, seed=1, powered=12, connected=4)
+    params, layout = um.Params(), layout_for_seed(1, um.Params(), 12, 4)
+    alone = policy(params, layout, um.initial_state(params, layout))
+    three = layout.replace(fleet=um.load_scenario(uavs=3).layout.fleet)
+    state = um.initial_state(params, three)
+    action = jax.jit(policy)(params, three, state)
+    assert action.shape == (3,)
+    assert action[0] == alone
+    batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), state)
+    assert_array_equal(policy(params, three, batch), [action, action])
+    depot = layout.replace(depots=um.load_scenario(depot="swap").layout.depots)
+    low = um.initial_state(params, depot).replace(uav_energy=jnp.array([1000.0]))
+    assert policy(params, depot, low) == 12  # it stands at the depot
+    assert policy.lifted_to(layout) == []
+    assert "the UAV returns by a rule" in policy.lifted_to(depot)[0]
+    assert "the UAVs decide in turn by it and return by a rule" in policy.lifted_to(three)[0]
+
+
+def test_rules_of_fleets_have_names():
+    assert load_policy("split-deadline") is FLEET_HEURISTICS["split-deadline"]
+    with pytest.raises(PolicyError, match="did you mean 'split-deadline'"):
+        load_policy("split-deadlin")

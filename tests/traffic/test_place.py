@@ -51,7 +51,7 @@ def test_defaults_and_overrides():
         ({"simulation": {"window_s": 1.0}}, "simulation.window_s is 1; give at most 1000 windows in 7200 s"),
         ({"simulation": {"mean_s": [7200.0, 9000.0]}}, "simulation.mean_s is [7200.0, 9000.0]; give [from, to]"),
         ({"devices": {"count": 1}}, "devices.count is 1; it should be greater than or equal to 2"),
-        ({"device": [{"name": "a", "junction": "j"}]}, "holds 1 [[device]] tables; give 2 to 64, or none"),
+        ({"device": [{"name": "a", "junction": "j"}]}, "holds 1 [[device]] tables; give 2 to 1000, or none"),
         ({"device": [{"name": "a"}, {"name": "b"}]}, "device 'a': place is unclear; give junction, or x_m and y_m"),
         ({"device": [{"name": "a", "junction": "j", "x_m": 1, "y_m": 2}] * 2}, "device 'a': place is unclear"),
         ({"device": [{"name": "a", "junction": "j"}] * 2}, "device name 'a' is given twice; names must differ"),

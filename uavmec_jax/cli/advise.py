@@ -13,7 +13,10 @@ from uavmec_jax.cli.options import ScenarioChoice, json_option, scenario_options
 @click.option(
     "--state", type=click.Path(path_type=Path), help="File of the current state, JSON (default: the initial state)."
 )
-@click.option("--policy", default="generalist", help="Name or file of the policy to follow (default: generalist).")
+@click.option(
+    "--policy",
+    help="Name or file of the policy to follow (default: generalist; with several UAVs or depots, earliest-deadline).",
+)
 @click.option("--samples", type=int, default=256, help="Futures to simulate for each candidate (default: 256).")
 @click.option("--what-if/--no-what-if", default=True, help="Also evaluate every repair and removal of a device.")
 @click.option("--price", type=float, help="Price of a first failure of the busiest device, in slots of lifetime.")
@@ -21,30 +24,30 @@ from uavmec_jax.cli.options import ScenarioChoice, json_option, scenario_options
 def advise(
     scenario: ScenarioChoice,
     state: Path | None,
-    policy: str,
+    policy: str | None,
     samples: int,
     what_if: bool,
     price: float | None,
     as_json: bool,
 ) -> None:
-    """Recommend the next visit in SCENARIO, a file (TOML or CSV), or in a random scenario; nothing is trained."""
+    """Recommend the next visit of each UAV in SCENARIO, a file (TOML or CSV), or in a random scenario; nothing is trained."""
     if not 2 <= samples <= 100_000:
         raise InputError(f"--samples is {samples}; give 2 to 100000 futures")
     from rich.console import Console
 
     from uavmec_jax.reporting.advice import advice_data, advice_lines, advice_tables
-    from uavmec_jax.scenarios.advice import advise_on
+    from uavmec_jax.scenarios.advice import advise_on, default_policy
     from uavmec_jax.scenarios.state_files import state_data
 
     named = scenario.load(state)
     if price is not None:
         named = named.with_failure_price(price)
+    policy = default_policy(named) if policy is None else policy
     advice, warnings = advise_on(named, policy, samples=samples, what_if=what_if, seed=scenario.axes["seed"])
     for line in warnings:
         click.echo(f"uavmec: warning: {line}", err=True)
-    names = named.device_names
     if as_json:
         head = {"command": command_line(), "policy": policy, "warnings": warnings}
-        print_json(head | advice_data(advice, names) | {"state": state_data(named)})
+        print_json(head | advice_data(advice, named) | {"state": state_data(named)})
         return
-    print_tables(Console(), advice_tables(advice, names), advice_lines(advice, names))
+    print_tables(Console(), advice_tables(advice, named), advice_lines(advice, named))

@@ -27,20 +27,21 @@ def plan(scenario: ScenarioChoice, draws: int, width: int, out: Path | None, as_
     host.use_all_cores()
     from rich.console import Console
 
-    from uavmec_jax.planning.plan import make_plan
+    from uavmec_jax.planning.plan import PLANNED_SLOTS, make_plan
     from uavmec_jax.reporting.plan import plan_data, plan_summary, plan_tables, save_plan
     from uavmec_jax.runs.results_folder import check_directory
 
     named = scenario.load()
+    if "max_slots" not in scenario.settings:
+        named = named.with_slot_limit(PLANNED_SLOTS)
     directory = out or new_folder("plan")
     check_directory(directory)
     result = make_plan(named.params, named.layout, named.draws(draws), width=width)
     save_plan(result, named, directory, command_line())
     if as_json:
-        print_json(plan_data(result, named.device_names, named.name))
+        print_json(plan_data(result, named))
         return
-    names = named.device_names
-    print_tables(Console(), plan_tables(result, names), plan_summary(result, names), directory)
+    print_tables(Console(), plan_tables(result, named), plan_summary(result, named), directory)
 
 
 @click.command()
@@ -93,7 +94,8 @@ def evaluate(
         print_json(head | about | {"policies": rows})
         return
     console = Console()
-    console.print(f"[bold]Lifetime over {draws} volume draws ± 95 %[/bold]")
+    measured = "Share of the horizon in service" if "service" in rows[0] else "Lifetime"
+    console.print(f"[bold]{measured} over {draws} volume draws ± 95 %[/bold]")
     console.print(evaluation_table(rows))
     if trained is not None:
         for line in _training_lines(trained, named, scenario):
@@ -105,6 +107,7 @@ def _training_lines(trained: Any, named: Any, scenario: ScenarioChoice) -> list[
     axes = ", ".join(f"{name} {value}" for name, value in trained.trained_on.items())
     lines = [f"Trained by {trained.algorithm.upper()} on {axes}."]
     lines += [f"Out of distribution: {line}." for line in trained.out_of_distribution(named.params, named.layout)]
+    lines += [f"{line[0].upper()}{line[1:]}." for line in trained.lifted_to(named.layout)]
     here = scenario.axes
     elsewhere = (
         scenario.file is not None

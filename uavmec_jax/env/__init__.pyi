@@ -4,6 +4,10 @@ from .dynamics import State as State
 from .dynamics import initial_state as initial_state
 from .dynamics import transition as transition
 from .environment import UavMecEnv as UavMecEnv
+from .fleet import Depots as Depots
+from .fleet import Fleet as Fleet
+from .fleet import make_depots as make_depots
+from .fleet import make_fleet as make_fleet
 from .generator import ScenarioDistribution as ScenarioDistribution
 from .generator import sample_scenario as sample_scenario
 from .hardware import DEVICE_TYPES as DEVICE_TYPES
@@ -13,6 +17,8 @@ from .layout import Traffic as Traffic
 from .layout import make_layout as make_layout
 from .layout import pad_layout as pad_layout
 from .layout import sample_layout as sample_layout
+from .measures import ServiceMeasures as ServiceMeasures
+from .measures import measure as measure
 from .observation import observe as observe
 from .params import MAX_DEVICES as MAX_DEVICES
 from .params import Params as Params

@@ -126,8 +126,7 @@ def in_service(params: Params, layout: Layout, state: State) -> Bool[Array, " n"
 
 def service(params: Params, layout: Layout, state: State) -> Float[Array, ""]:
     """Return the share of the devices that are :func:`in_service`, weighted by their priorities."""
-    weight = jnp.ones(layout.n_devices) if layout.priority is None else layout.priority
-    weight = weight if layout.present is None else jnp.where(layout.present, weight, 0.0)
+    weight = layout.service_weight()
     total = jnp.sum(weight)
     return jnp.sum(jnp.where(in_service(params, layout, state), weight, 0.0)) / jnp.where(total > 0, total, 1.0)
 

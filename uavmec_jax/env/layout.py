@@ -103,6 +103,11 @@ class Layout:
         """Return the positions of all places in m, without batch axes."""
         return self.position if self.depots is None else jnp.concatenate([self.position, self.depots.position])
 
+    def service_weight(self) -> Float[Array, "*batch n"]:
+        """Return the weight of each device in measures of service: its priority, 1 by default; padding weighs nothing."""
+        weight = jnp.ones(self.capacity.shape) if self.priority is None else self.priority
+        return weight if self.present is None else jnp.where(self.present, weight, 0.0)
+
     def failure_price(self, seconds: Num[ArrayLike, ""]) -> Float[Array, " n"]:
         """Return the price of each device's first failure, in slots of lifetime, at a time as in :meth:`Traffic.at`."""
         if self.traffic is None:

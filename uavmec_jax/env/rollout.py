@@ -33,8 +33,8 @@ class Episode:
         failed: devices that failed in the last slot.
         first_failure: each device's share in the first failure; sums to 1 unless no device failed.
         lasted: share of the last slot that was over when the first battery ran out, 1 if none did.
-        service_s: with ``end = "horizon"``, seconds in which the devices were in service (:func:`dynamics.service`), mean
-            over the devices weighted by their priorities; else ``None``.
+        service_s: with ``end = "horizon"``, seconds until the horizon in which the devices were in service
+            (:func:`dynamics.service`), mean over the devices weighted by their priorities; else ``None``.
     """
 
     length: Int[Array, "*batch"]
@@ -102,7 +102,8 @@ def _play(
         actions = progress.actions.at[state.slot].set(action, mode="drop") if slots else progress.actions
         if first_failure is not None and service_s is not None:
             first_failure = jnp.where(jnp.any(first_failure > 0), first_failure, outcome.first_failure)
-            service_s = service_s + outcome.duration * service(params, layout, after)
+            until_horizon = jnp.clip(params.horizon_s - state.elapsed, 0.0, outcome.duration)
+            service_s = service_s + until_horizon * service(params, layout, after)
         return _Progress(after, outcome, actions, first_failure, service_s)
 
     goes_on = params.end == "horizon"

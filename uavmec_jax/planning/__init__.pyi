@@ -1,5 +1,6 @@
 from .advice import Advice as Advice
 from .advice import Candidate as Candidate
+from .advice import UavAdvice as UavAdvice
 from .advice import advise as advise
 from .beam import Tour as Tour
 from .beam import beam_search as beam_search
@@ -10,6 +11,7 @@ from .deadlines import earliest_deadline as earliest_deadline
 from .fleet_demand import horizon as horizon
 from .forecast import Forecast as Forecast
 from .forecast import make_forecast as make_forecast
+from .heuristics import FLEET_HEURISTICS as FLEET_HEURISTICS
 from .heuristics import HEURISTICS as HEURISTICS
 from .observation import FEATURES as FEATURES
 from .observation import Observation as Observation
@@ -17,3 +19,4 @@ from .observation import observe_devices as observe_devices
 from .plan import Plan as Plan
 from .plan import make_plan as make_plan
 from .rollout_planner import rollout_planner as rollout_planner
+from .service_bound import service_bound as service_bound

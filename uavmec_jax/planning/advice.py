@@ -18,9 +18,9 @@ from uavmec_jax.env.dynamics import State, complete_state, initial_state
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Episode, Policy, rollout_from, trace_from
-from uavmec_jax.planning.changes import WhatIf, every_change, rank_changes
+from uavmec_jax.planning.changes import WhatIf, layouts_to_try, rank_changes
 from uavmec_jax.planning.forecast import SAMPLES, Forecast
-from uavmec_jax.planning.rollout_planner import candidates_of, prefer, try_candidates
+from uavmec_jax.planning.rollout_planner import candidates_of, prefer, try_candidates, values_of
 
 _RETURN_SAMPLES = 32
 """Futures in which it is looked up when the UAVs return to a depot."""
@@ -37,9 +37,11 @@ class Candidate:
         device: index of the place from 0: a device, or behind the devices a depot.
         lifetime: slots, mean over the futures if the UAV flies there next and the policy decides from then on.
         behind: slots by which the best candidate's value exceeds this one's on the same futures. The value of a future is
-            its lifetime minus the price of its first failure, if the layout's traffic has prices. With
-            ``end = "horizon"`` it is the share of the time to the horizon in which the devices are in service.
+            its lifetime minus the price of its first failure, if the layout's traffic has prices; for fleets, the last slot
+            counts up to the first failure in it. With ``end = "horizon"`` it is the share of the time left to the horizon in
+            which the devices are in service.
         behind_low, behind_high: 95 % confidence interval of that difference over the futures.
+        service: with ``end = "horizon"``, that share, mean over the futures; else ``None``.
     """
 
     device: int
@@ -47,6 +49,7 @@ class Candidate:
     behind: float
     behind_low: float
     behind_high: float
+    service: float | None = None
 
 
 @dataclass(frozen=True)
@@ -58,11 +61,13 @@ class UavAdvice:
         policy_choice: index of the place that the policy itself would send it to.
         returns_in: slots until it flies to a depot, this one counting 0, median over futures in which it follows the policy
             from the next slot on; NaN if in most of them it never does.
+        returns_in_s: s until the slot in which it does, likewise.
     """
 
     candidates: tuple[Candidate, ...]
     policy_choice: int
     returns_in: float = math.nan
+    returns_in_s: float = math.nan
 
     @property
     def place(self) -> int:
@@ -135,14 +140,14 @@ def advise(
         lifetimes, value = np.asarray(episodes.length, float), _values(params, layout, state, episodes)
         mine = int(np.atleast_1d(choice)[uav])
         best = int(np.argmax(prefer(mine, value.mean(axis=1))))
-        uavs.append(UavAdvice(candidates=_rank(lifetimes, value, best), policy_choice=mine))
+        candidate_list = _rank(lifetimes, value, best, values_are_shares=params.end == "horizon")
+        uavs.append(UavAdvice(candidates=candidate_list, policy_choice=mine))
         action = candidates[best]
     if layout.n_depots:
-        returns_in = np.asarray(_returns_in(policy, params, layout, state, futures[:_RETURN_SAMPLES], action))
-        median = np.median(np.where(returns_in < 0, np.inf, returns_in), axis=0)
+        slots, seconds = _returns_in(policy, params, layout, state, futures[:_RETURN_SAMPLES], action)
         uavs = [
-            replace(uav, returns_in=float(slots) if np.isfinite(slots) else math.nan)
-            for uav, slots in zip(uavs, median, strict=True)
+            replace(uav, returns_in=_median(slots[:, v]), returns_in_s=_median(seconds[:, v]))
+            for v, uav in enumerate(uavs)
         ]
     return Advice(
         uavs=tuple(uavs),
@@ -151,12 +156,24 @@ def advise(
     )
 
 
+def _median(values: Float[Array, " S"]) -> float:
+    """Return the median over the futures; NaN if it is not finite."""
+    median = float(np.median(np.asarray(values)))
+    return median if math.isfinite(median) else math.nan
+
+
+def _seconds_left(params: Params, state: State) -> float:
+    """Return the time to the horizon, at least 1 s."""
+    return max(float(params.horizon_s) - float(state.elapsed), 1.0)
+
+
 def _values(params: Params, layout: Layout, state: State, episodes: Episode) -> Float[np.ndarray, "C S"]:
     """Return the value of each future of each candidate; see :class:`Candidate`."""
+    value = np.asarray(values_of(params, layout, episodes), float)
     if params.end == "horizon":
-        return np.asarray(episodes.service_s) / float(params.horizon_s)
+        return value / _seconds_left(params, state)
     price = np.asarray(layout.failure_price(state.elapsed))
-    return np.asarray(episodes.length, float) - np.asarray(episodes.first_failure) @ price
+    return value - np.asarray(episodes.first_failure) @ price
 
 
 @partial(jax.jit, static_argnames="policy")
@@ -186,39 +203,42 @@ def _try_candidates(
 @partial(jax.jit, static_argnames="policy")
 def _returns_in(
     policy: Policy, params: Params, layout: Layout, state: State, futures: Key[Array, " S"], action: Int[Array, "*K"]
-) -> Int[Array, "S K"]:
-    """Return the slots until each UAV first flies to a depot in each future, -1 if it does not."""
+) -> tuple[Float[Array, "S K"], Float[Array, "S K"]]:
+    """Return the slots and the seconds until each UAV first flies to a depot in each future, inf if it does not."""
 
-    def slots_until(future: PRNGKeyArray) -> Int[Array, " K"]:
+    def until(future: PRNGKeyArray) -> tuple[Float[Array, " K"], Float[Array, " K"]]:
         def act(params: Params, layout: Layout, later: State, key: PRNGKeyArray | None = None) -> Array:
             return jnp.where(later.slot == state.slot, action, policy(params, layout, later, key))
 
         slots = trace_from(act, params, layout, state, future, _RETURN_SLOTS)
-        to_depot = slots.played[:, None] & (slots.action.reshape(_RETURN_SLOTS, -1) >= layout.n_devices)
-        return jnp.where(jnp.any(to_depot, axis=0), jnp.argmax(to_depot, axis=0), -1)
+        flies = slots.played[:, None] & ~jnp.concatenate([state.grounded[None], slots.state.grounded[:-1]])
+        to_depot = flies & (slots.action.reshape(_RETURN_SLOTS, -1) >= layout.n_devices)
+        first, ever = jnp.argmax(to_depot, axis=0), jnp.any(to_depot, axis=0)
+        begins = jnp.append(jnp.asarray(state.elapsed), slots.state.elapsed)
+        seconds = begins[first] - state.elapsed
+        return jnp.where(ever, first.astype(jnp.float32), jnp.inf), jnp.where(ever, seconds, jnp.inf)
 
-    return jax.vmap(slots_until)(futures)
+    return jax.vmap(until)(futures)
 
 
 def _try_changes(
     policy: Policy, params: Params, layout: Layout, state: State, futures: Key[Array, " S"]
 ) -> tuple[WhatIf, ...]:
     """Return the effect of every change of one device if the policy decides from the present state on."""
-    layouts = jax.tree.map(lambda *leaves: jnp.stack(leaves), layout, *every_change(layout))
-    lifetimes = np.asarray(_lifetimes(policy, params, layouts, state, futures))
-    return rank_changes(layout, lifetimes[1:], lifetimes[0])
+    episodes = _play_layouts(policy, params, layouts_to_try(params, layout), state, futures)
+    return rank_changes(params, layout, episodes, _seconds_left(params, state))
 
 
 @partial(jax.jit, static_argnames="policy")
-def _lifetimes(
-    policy: Policy, params: Params, layouts: Layout, state: State, futures: Key[Array, " S"]
-) -> Int[Array, "L S"]:
-    """Return the lifetime in every future for each of ``L`` layouts."""
-    lifetime = lambda layout, future: rollout_from(policy, params, layout, state, future).length  # noqa: E731
-    return jax.vmap(jax.vmap(lifetime, (None, 0)), (0, None))(layouts, futures)
+def _play_layouts(policy: Policy, params: Params, layouts: Layout, state: State, futures: Key[Array, " S"]) -> Episode:
+    """Return the episode of every future for each of ``L`` layouts, leaves ``[L, S, ...]``."""
+    play = lambda layout, future: rollout_from(policy, params, layout, state, future)  # noqa: E731
+    return jax.vmap(jax.vmap(play, (None, 0)), (0, None))(layouts, futures)
 
 
-def _rank(lifetimes: Float[np.ndarray, "n S"], value: Float[np.ndarray, "n S"], best: int) -> tuple[Candidate, ...]:
+def _rank(
+    lifetimes: Float[np.ndarray, "C S"], value: Float[np.ndarray, "C S"], best: int, *, values_are_shares: bool
+) -> tuple[Candidate, ...]:
     """Return the candidates, ``best`` first, then in descending order of their mean value."""
     behind = value[best] - value
     futures = value.shape[1]
@@ -231,6 +251,7 @@ def _rank(lifetimes: Float[np.ndarray, "n S"], value: Float[np.ndarray, "n S"], 
             behind=float(behind[device].mean()),
             behind_low=float(behind[device].mean() - half_width[device]),
             behind_high=float(behind[device].mean() + half_width[device]),
+            service=float(value[device].mean()) if values_are_shares else None,
         )
         for device in order
     )

@@ -111,8 +111,9 @@ def _what_is_left(
 ) -> tuple[Array, Array | int, Array, Array | float]:
     """Return the visits that the UAVs can still make, how many they make in a slot, and their spare energy in J.
 
-    The last value is, for a fleet, how tight the devices are that need a visit in nearly every slot: no number of UAVs
-    makes two services of a device in one slot count.
+    The last value is, for a fleet, how tight the devices are that need a visit in nearly every slot, since no number of UAVs
+    makes two services of a device in one slot count; plus the share of its battery that each device needs at least, which
+    tells states apart in which no visits are needed if all slots are as short as can be.
     """
     params, layout = problem.params, problem.layout
     remaining, shortest = target - 1 - slot, jnp.min(problem.costs.duration, axis=1)
@@ -130,7 +131,12 @@ def _what_is_left(
     room = fleet_demand.visits_in(params, layout, states, remaining, least)
     servers = jnp.sum(~states.grounded, axis=-1, keepdims=True)
     tightest = jnp.sum((jnp.maximum(exact, 0.0) / jnp.maximum(remaining, 1)) ** 4, axis=-1)
-    return room, servers, spare, tightest
+    ahead = (index >= slot) & (index < target - 1)
+    least_drain = layout.standby_power * jnp.sum(jnp.where(ahead, shortest, 0.0)) + jnp.sum(
+        jnp.where(ahead[:, None], jnp.minimum(problem.costs.upload, problem.costs.work), 0.0), axis=0
+    )
+    strain = jnp.where(layout.has_power, 0.0, least_drain / jnp.maximum(states.battery, 1.0))
+    return room, servers, spare, tightest + jnp.sum(strain, axis=-1)
 
 
 def _probably_late(

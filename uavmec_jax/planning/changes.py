@@ -1,12 +1,16 @@
 """What-if changes of one device: repair its power, repair its communication, or remove it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Num
 
 from uavmec_jax.env.layout import Layout
+from uavmec_jax.env.params import Params
+from uavmec_jax.env.rollout import Episode
 
 CHANGES = ("repair power", "repair comms", "remove")
 """Names of the changes, in the order of :func:`every_change`."""
@@ -14,19 +18,24 @@ CHANGES = ("repair power", "repair comms", "remove")
 
 @dataclass(frozen=True)
 class WhatIf:
-    """The effect of changing one device.
+    """The effect of changing one device, mean over the draws.
 
     Attributes:
         device: index from 0.
         change: one of :data:`CHANGES`.
-        lifetime: slots with the change, mean over the draws.
-        gain: slots gained by the change, mean over the same draws.
+        lifetime: slots with the change.
+        gain: slots gained by the change; with ``end = "horizon"``, what it adds to ``service``.
+        at_least: whether a lifetime with the change reached ``max_slots``: it and the gain may be larger.
+        service: with ``end = "horizon"``, the share of the time to the horizon in which the devices are in service with the
+            change, else ``None``. A device that is removed does not count, nor does it in what its removal gains.
     """
 
     device: int
     change: str
     lifetime: float
     gain: float
+    at_least: bool = False
+    service: float | None = None
 
 
 def every_change(layout: Layout) -> list[Layout]:
@@ -37,7 +46,8 @@ def every_change(layout: Layout) -> list[Layout]:
 def changed(layout: Layout, device: int, change: str) -> Layout:
     """Return the layout after one change.
 
-    A removed device stays in the arrays: it lacks nothing, has no work, and its hover point becomes that of a neighbour.
+    A removed device stays in the arrays: it lacks nothing, has no work, and its hover point becomes that of a neighbour. It
+    is marked as absent if the layout says which devices are present.
     """
     if change == "repair power":
         return replace(layout, has_power=layout.has_power.at[device].set(True))
@@ -51,28 +61,71 @@ def changed(layout: Layout, device: int, change: str) -> Layout:
         has_power=layout.has_power.at[device].set(True),
         has_comms=layout.has_comms.at[device].set(True),
         processing_rate=layout.processing_rate.at[device].set(jnp.inf),
+        present=None if layout.present is None else layout.present.at[device].set(False),
     )
 
 
-def rank_changes(
-    layout: Layout, lifetimes: Int[np.ndarray, "changes D"], unchanged: Int[np.ndarray, " D"]
-) -> tuple[WhatIf, ...]:
+def layouts_to_try(params: Params, layout: Layout) -> Layout:
+    """Return the layout as it is and after each of :func:`every_change`, leaves ``[L, ...]``.
+
+    With ``end = "horizon"``, those follow in which one device is there but weighs nothing: removals are compared with them.
+    """
+    if params.end != "horizon":
+        return _stack([layout, *every_change(layout)])
+    weight = layout.service_weight()
+    marked = replace(layout, present=_marked(layout), priority=weight)
+    ignored = [replace(marked, priority=weight.at[device].set(0.0)) for device in range(layout.n_devices)]
+    return _stack([marked, *every_change(marked), *ignored])
+
+
+def _marked(layout: Layout) -> jax.Array:
+    return jnp.ones(layout.n_devices, bool) if layout.present is None else layout.present
+
+
+def _stack(layouts: list[Layout]) -> Layout:
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *layouts)
+
+
+def rank_changes(params: Params, layout: Layout, episodes: Episode, seconds: float) -> tuple[WhatIf, ...]:
     """Return the effects of the changes that repair what a device lacks or remove it, the largest gain first.
 
     Args:
+        params: scenario parameters.
         layout: without any change.
-        lifetimes: ``[3 * n, D]`` slots on each draw after each of :func:`every_change`.
-        unchanged: ``[D]`` slots on the same draws without any change.
+        episodes: of each of :func:`layouts_to_try` on the same draws, leaves ``[L, D, ...]``.
+        seconds: time to the horizon, if there is one.
     """
-    by_device = lifetimes.reshape(len(CHANGES), -1, len(unchanged))
-    applies = {
-        "repair power": ~np.asarray(layout.has_power),
-        "repair comms": ~np.asarray(layout.has_comms),
-        "remove": np.ones(by_device.shape[1], bool),
-    }
+    n, goes_on = layout.n_devices, params.end == "horizon"
+    changes = slice(1, 1 + len(CHANGES) * n)
+    lifetimes = np.asarray(episodes.length)
+    values = np.asarray(episodes.service_s, float) / seconds if goes_on else lifetimes
+    unchanged = np.broadcast_to(values[0], values[changes].shape)
+    if goes_on:
+        unchanged = np.concatenate([unchanged[:-n], values[changes.stop :]])
+    gains = _by_change(values[changes] - unchanged, n)
+    lived, served = _by_change(lifetimes[changes], n), _by_change(values[changes], n)
     effects = [
-        WhatIf(device, change, float(after[device].mean()), float((after[device] - unchanged).mean()))
-        for change, after in zip(CHANGES, by_device, strict=True)
-        for device in np.flatnonzero(applies[change]).tolist()
+        WhatIf(
+            device,
+            change,
+            lifetime=float(lived[number, device].mean()),
+            gain=float(gains[number, device].mean()),
+            at_least=bool(lived[number, device].max() >= params.max_slots) and not goes_on,
+            service=float(served[number, device].mean()) if goes_on else None,
+        )
+        for number, change in enumerate(CHANGES)
+        for device in np.flatnonzero(_APPLIES[change](layout)).tolist()
     ]
     return tuple(sorted(effects, key=lambda effect: (-effect.gain, CHANGES.index(effect.change), effect.device)))
+
+
+def _by_change(values: Num[np.ndarray, "changes D"], n: int) -> Float[np.ndarray, "3 n D"]:
+    return np.asarray(values, float).reshape(len(CHANGES), n, -1)
+
+
+_APPLIES: dict[str, Callable[[Layout], np.ndarray]] = {
+    "repair power": lambda layout: ~np.asarray(layout.has_power),
+    "repair comms": lambda layout: ~np.asarray(layout.has_comms),
+    "remove": lambda layout: np.ones(layout.n_devices, bool),
+}
+"""Change -> the devices for which it makes sense."""

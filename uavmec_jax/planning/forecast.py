@@ -6,7 +6,7 @@ from functools import partial
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Float, Int, Key, Num
 
 from uavmec_jax.env.dynamics import Cause, State, complete_state, initial_state
 from uavmec_jax.env.layout import Layout
@@ -25,14 +25,17 @@ class Forecast:
         lifetimes: ``[S]`` slots, counted from the first slot of the scenario: those already survived are included.
         first_failure: ``[n]`` probability that each device is the first to fail; they sum to 1 minus :attr:`no_failure`.
         failure_slot: ``[n]`` slot in which each device fails, mean over the episodes in which it is the first; NaN if
-            it never is.
+            it never is, and with ``end = "horizon"``, where episodes go on.
         causes: share of the episodes that each :class:`Cause` ends; causes that do not occur are left out.
+        service_s: ``[S]`` with ``end = "horizon"``, seconds in service from the present state on, see :class:`Episode`;
+            else ``None``.
     """
 
     lifetimes: Int[np.ndarray, " S"]
     first_failure: Float[np.ndarray, " n"]
     failure_slot: Float[np.ndarray, " n"]
     causes: Mapping[Cause, float]
+    service_s: Float[np.ndarray, " S"] | None = None
 
     @classmethod
     def of(cls, episodes: Episode) -> "Forecast":
@@ -40,25 +43,35 @@ class Forecast:
         lifetimes, causes, share = (
             np.asarray(leaf) for leaf in (episodes.length, episodes.cause, episodes.first_failure)
         )
-        total = share.sum(axis=0)
+        total = share.sum(axis=0) * (episodes.service_s is None)
         slot = (share * lifetimes[:, None]).sum(axis=0) / np.maximum(total, 1e-9)
         return cls(
             lifetimes=lifetimes.astype(int),
             first_failure=share.mean(axis=0),
             failure_slot=np.where(total > 0, slot, np.nan),
             causes={cause: float(np.mean(causes == cause)) for cause in Cause if np.any(causes == cause)},
+            service_s=None if episodes.service_s is None else np.asarray(episodes.service_s),
         )
 
     @property
     def interval(self) -> tuple[float, float]:
         """Slots between which 95 % of the episodes end."""
-        low, high = np.percentile(self.lifetimes, [2.5, 97.5])
-        return float(low), float(high)
+        return _middle(self.lifetimes)
+
+    @property
+    def service_interval(self) -> tuple[float, float] | None:
+        """Seconds in service between which 95 % of the episodes are; ``None`` without a horizon."""
+        return None if self.service_s is None else _middle(self.service_s)
 
     @property
     def no_failure(self) -> float:
         """Probability that no device fails before the UAV's battery or the time limit ends the episode."""
         return max(1.0 - float(self.first_failure.sum()), 0.0)
+
+
+def _middle(values: Num[np.ndarray, " S"]) -> tuple[float, float]:
+    low, high = np.percentile(values, [2.5, 97.5])
+    return float(low), float(high)
 
 
 def make_forecast(

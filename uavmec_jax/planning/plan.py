@@ -7,15 +7,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, Key
+from jaxtyping import Array, Float, Int, Key
 
 from uavmec_jax.env.dynamics import Cause
 from uavmec_jax.env.layout import Layout
+from uavmec_jax.env.measures import ServiceMeasures, measure
 from uavmec_jax.env.params import Params
-from uavmec_jax.env.rollout import Trace, tour_policy, trace
-from uavmec_jax.planning.changes import WhatIf, every_change, rank_changes
+from uavmec_jax.env.rollout import Episode, Trace, tour_policy, trace
+from uavmec_jax.planning.changes import WhatIf, layouts_to_try, rank_changes
 from uavmec_jax.planning.fleet_deadlines import earliest_deadline
-from uavmec_jax.planning.fleet_demand import horizon
+from uavmec_jax.planning.fleet_demand import horizon, is_alone
 from uavmec_jax.planning.forecast import Forecast
 from uavmec_jax.planning.heuristics import FLEET_HEURISTICS, HEURISTICS
 from uavmec_jax.planning.parallel import (
@@ -24,11 +25,19 @@ from uavmec_jax.planning.parallel import (
     heuristic_episodes,
     policy_episodes,
     rollout_planner_episodes,
+    spread,
 )
 from uavmec_jax.planning.rollout_planner import SAMPLES
+from uavmec_jax.planning.service_bound import service_bound
 
 WIDTH = 256
 """States that the beam keeps: one scenario can afford more than a study (:data:`uavmec_jax.planning.beam.WIDTH`)."""
+
+PLANNED_SLOTS = 64
+"""Slots to plan for by default where depots let UAVs fly on for ever: ten hours or so."""
+
+_MOST_RECORDED = 4096
+"""Slots of a tour to a horizon that are recorded."""
 
 
 @dataclass(frozen=True)
@@ -37,22 +46,36 @@ class Plan:
 
     Attributes:
         params: scenario parameters.
-        layout: the devices.
-        lifetimes: ``[D]`` slots by policy: the heuristics, ``rollout``, and ``beam``, which is clairvoyant.
-        bound: ``[D]`` slots, certified upper bounds on the lifetime of any policy; at most ``max_slots``.
+        layout: the devices, the UAVs and the depots.
+        lifetimes: ``[D]`` slots by policy: the heuristics, ``rollout``, and ``beam``, which is clairvoyant. Where the end is
+            a horizon, there is no ``beam``, and they are the slots until then.
+        bound: ``[D]`` slots, certified upper bounds on the lifetime of any policy; at most ``max_slots``; ``None`` where the
+            end is a horizon.
         forecast: the forecast under the rollout planner.
         tours: slot by slot, those of ``rollout`` and ``beam`` on the first draw.
-        what_if: every repair and removal of one device, the largest gain first: under the rollout planner, for a fleet
-            under the earliest-deadline rule.
+        what_if: every repair and removal of one device, the largest gain first: under the rollout planner, for fleets and
+            where the end is a horizon under the earliest-deadline rule.
+        measures: ``[D]``, of the rollout planner's tours; averages over time where the end is a horizon, else over slots.
+        service: where the end is a horizon, ``[D]`` by policy: the share of the time to it in which the devices are in
+            service, weighted by priority; else ``None``.
+        service_bound: an upper bound on that share (:func:`uavmec_jax.planning.service_bound.service_bound`).
     """
 
     params: Params
     layout: Layout
     lifetimes: Mapping[str, Int[np.ndarray, " D"]]
-    bound: Int[np.ndarray, " D"]
+    bound: Int[np.ndarray, " D"] | None
     forecast: Forecast
     tours: Mapping[str, Trace]
     what_if: tuple[WhatIf, ...]
+    measures: ServiceMeasures
+    service: Mapping[str, Float[np.ndarray, " D"]] | None = None
+    service_bound: float | None = None
+
+    @property
+    def as_in_paper(self) -> bool:
+        """Whether the scenario is one of the paper's: one UAV, no depots, and the first failure is the end."""
+        return is_alone(self.layout) and self.service is None
 
 
 def make_plan(
@@ -60,52 +83,69 @@ def make_plan(
 ) -> Plan:
     """Plan for one scenario.
 
+    With ``end = "horizon"``, what counts is the time in service, not the lifetime: the rules and the rollout planner are
+    compared by it, and there is no beam.
+
     Args:
         params: scenario parameters.
-        layout: the devices.
-        draws: volume draws; lifetimes are evaluated on all of them, the tours are those of the first.
+        layout: the devices, the UAVs and the depots.
+        draws: volume draws; policies are evaluated on all of them, the tours are those of the first.
         width: states that the beam keeps.
         samples: futures that the rollout planner simulates per candidate.
     """
-    count = draws.shape[0]
-    if layout.n_uavs == 1:
+    count, goes_on = draws.shape[0], params.end == "horizon"
+    per_draw, unchanged = _repeat(params, count), _repeat(layout, count)
+    if plans_changes := is_alone(layout) and not goes_on:
         # One call of the rollout planner simulates the scenario as it is and with every change.
-        layouts, per_layout, all_draws = _with_changes(params, layout, draws)
+        per_layout, layouts, all_draws = _with_changes(params, layout, draws)
     else:
-        layouts, per_layout, all_draws = _repeat(layout, count), _repeat(params, count), draws
-    per_draw, unchanged = _repeat(params, count), jax.tree.map(lambda leaf: leaf[:count], layouts)
-    slots = horizon(per_layout, layouts)
-    tours, episodes = rollout_planner_episodes(per_layout, layouts, all_draws, slots=slots, samples=samples)
-    rollout = jax.tree.map(lambda leaf: np.asarray(leaf[:count]), episodes)
-    beam_tours, beam = beam_episodes(per_draw, unchanged, draws, slots=slots, width=width)
-    names = tuple(HEURISTICS if layout.n_uavs == 1 else FLEET_HEURISTICS)
-    simple = heuristic_episodes(names, *_repeat((params, layout), 1), draws[None])
-    lifetimes = {name: np.asarray(simple.length[k, 0]) for k, name in enumerate(names)}
-    lifetimes |= {"rollout": rollout.length, "beam": np.asarray(beam.length)}
-    longest = np.max(list(lifetimes.values()), axis=0)
-    if layout.n_uavs > 1:
-        layouts, per_layout, all_draws = _with_changes(params, layout, draws)
-        episodes = policy_episodes(earliest_deadline, per_layout, layouts, all_draws[:, None])
-    by_change = np.asarray(episodes.length).reshape(-1, count)
+        per_layout, layouts, all_draws = per_draw, unchanged, draws
+    slots = min(int(params.max_slots), _MOST_RECORDED) if goes_on else horizon(per_layout, layouts)
+    planned, tried = rollout_planner_episodes(per_layout, layouts, all_draws, slots=slots, samples=samples)
+    tours, episodes = {"rollout": planned[:count]}, _heuristics(params, layout, draws)
+    episodes["rollout"] = jax.tree.map(lambda leaf: np.asarray(leaf[:count]), tried)
+    bound = None
+    if not goes_on:
+        tours["beam"], episodes["beam"] = beam_episodes(per_draw, unchanged, draws, slots=slots, width=width)
+        longest = np.max([episode.length for episode in episodes.values()], axis=0)
+        bound = bound_scenarios(per_draw, unchanged, draws, longest, slots=slots)
+    if not plans_changes:
+        per_layout, layouts, all_draws = _with_changes(params, layout, draws)
+        tried = policy_episodes(earliest_deadline, per_layout, layouts, all_draws[:, None])
+        tried = jax.tree.map(lambda leaf: leaf[:, 0], tried)
+    by_change = jax.tree.map(lambda leaf: leaf.reshape(-1, count, *leaf.shape[1:]), tried)
     return Plan(
         params=params,
         layout=jax.tree.map(np.asarray, layout),
-        lifetimes=lifetimes,
-        bound=bound_scenarios(per_draw, unchanged, draws, longest, slots=slots),
-        forecast=Forecast.of(rollout),
-        tours={
-            name: _started_slots(_trace(params, layout, draws[0], tour))
-            for name, tour in (("rollout", tours[0]), ("beam", beam_tours[0]))
-        },
-        what_if=rank_changes(layout, by_change[1:], by_change[0]),
+        lifetimes={name: np.asarray(episode.length) for name, episode in episodes.items()},
+        bound=bound,
+        forecast=Forecast.of(episodes["rollout"]),
+        tours={name: _started_slots(_trace(params, layout, draws[0], tour[0])) for name, tour in tours.items()},
+        what_if=rank_changes(params, layout, by_change, float(params.horizon_s)),
+        measures=jax.tree.map(np.asarray, _measures(per_draw, unchanged, draws, tours["rollout"])),
+        service=_shares(params, episodes) if goes_on else None,
+        service_bound=float(service_bound(params, layout)) if goes_on else None,
     )
 
 
-def _with_changes(params: Params, layout: Layout, draws: Key[Array, " D"]) -> tuple[Layout, Params, Key[Array, " LD"]]:
+def _heuristics(params: Params, layout: Layout, draws: Key[Array, " D"]) -> dict[str, Episode]:
+    """Return the episodes of the heuristics by name, leaves ``[D, ...]``."""
+    names = tuple(HEURISTICS if layout.n_uavs == 1 else FLEET_HEURISTICS)
+    episodes = heuristic_episodes(names, *_repeat((params, layout), 1), draws[None])
+    return {name: jax.tree.map(lambda leaf, k=k: np.asarray(leaf[k, 0]), episodes) for k, name in enumerate(names)}
+
+
+def _shares(params: Params, episodes: Mapping[str, Episode]) -> dict[str, Float[np.ndarray, " D"]]:
+    """Return the shares of the time to the horizon in which the devices are in service."""
+    return {name: np.asarray(episode.service_s, float) / float(params.horizon_s) for name, episode in episodes.items()}
+
+
+def _with_changes(params: Params, layout: Layout, draws: Key[Array, " D"]) -> tuple[Params, Layout, Key[Array, " LD"]]:
     """Return the layout as it is and with every change, each with every draw: leaves ``[L * D, ...]``."""
-    layouts = [layout, *every_change(layout)]
-    repeated = jax.tree.map(lambda *leaves: jnp.repeat(jnp.stack(leaves), len(draws), axis=0), *layouts)
-    return repeated, _repeat(params, len(layouts) * len(draws)), jnp.tile(draws, len(layouts))
+    layouts = layouts_to_try(params, layout)
+    count = layouts.capacity.shape[0]
+    repeated = jax.tree.map(lambda leaf: jnp.repeat(leaf, len(draws), axis=0), layouts)
+    return _repeat(params, count * len(draws)), repeated, jnp.tile(draws, count)
 
 
 def _repeat(tree: Any, count: int) -> Any:
@@ -114,9 +154,19 @@ def _repeat(tree: Any, count: int) -> Any:
 
 
 @jax.jit
-def _trace(params: Params, layout: Layout, draw: Key[Array, ""], tour: Int[Array, " H"]) -> Trace:
+def _trace(params: Params, layout: Layout, draw: Key[Array, ""], tour: Int[Array, "H *K"]) -> Trace:
     """Simulate a tour on one volume draw, slot by slot."""
     return trace(tour_policy(tour), params, layout, draw, tour.shape[0])
+
+
+@jax.jit
+def _measures(params: Params, layouts: Layout, draws: Key[Array, " D"], tours: Int[Array, "D H *K"]) -> ServiceMeasures:
+    """Simulate tours, each on its draw, and measure them; leaves ``[D]``."""
+
+    def measured(params: Params, layout: Layout, draw: Key[Array, ""], tour: Int[Array, "H *K"]) -> ServiceMeasures:
+        return measure(params, layout, _trace(params, layout, draw, tour), by_time=params.end == "horizon")
+
+    return spread(measured, params, layouts, draws, tours)
 
 
 def _started_slots(slots: Trace) -> Trace:

@@ -1,4 +1,4 @@
-"""One evacuation slot by slot as an animated GIF: traffic, the UAV's tour, batteries, data ages."""
+"""One evacuation slot by slot as an animated GIF: traffic, the tours of the UAVs, batteries, data ages."""
 
 from pathlib import Path
 
@@ -9,11 +9,12 @@ from matplotlib.animation import PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from uavmec_jax.env.layout import Layout
+from uavmec_jax.env.layout import Layout, fleet_of
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Policy, Trace, trace
 from uavmec_jax.files.writing import atomic
 from uavmec_jax.reporting.canvas import new_figure
+from uavmec_jax.reporting.map_figure import uav_colour
 from uavmec_jax.reporting.road_map import density_legend, draw_roads, draw_sites, set_limits
 from uavmec_jax.traffic.evacuation import Evacuation
 
@@ -59,7 +60,12 @@ def _draw_slot(
     now, age_limit = jax.tree.map(lambda leaf: leaf[slot], episode), float(params.data_age_limit_slots)
     elapsed, failed = float(now.state.elapsed), np.asarray(now.outcome.first_failure)
     window = min(int(elapsed // evacuation.meta["window_s"]), len(evacuation.road_density) - 1)
-    _draw_traffic(axes[0], evacuation, np.asarray(layout.position), episode, slot, window)
+    start = np.asarray(fleet_of(params, layout).start_m)
+    stops = np.concatenate([start[None], episode.state.uav_position[: slot + 1]])
+    scale = max(evacuation.region_m()) / max(
+        float(np.max(layout.position)), 1.0
+    )  # layouts may be scaled copies of a place
+    _draw_traffic(axes[0], evacuation, stops * scale, window)
     axes[0].set_title(f"{title}: slot {slot + 1}, {elapsed / 60:.0f} min after the order", fontsize=10)
     battery = np.asarray(now.state.battery) / np.asarray(layout.capacity)
     _draw_bars(axes[1], battery, np.asarray(layout.has_power), failed, "battery", 1.0)
@@ -67,18 +73,17 @@ def _draw_slot(
     axes[2].axvline(age_limit, color="black", lw=0.8, ls=":")
 
 
-def _draw_traffic(
-    axis: Axes, evacuation: Evacuation, position: Float[np.ndarray, "n 2"], episode: Trace, slot: int, window: int
-) -> None:
-    """Draw the roads with their densities in a window, the devices, and the tour up to a slot."""
+def _draw_traffic(axis: Axes, evacuation: Evacuation, stops: Float[np.ndarray, "stops K 2"], window: int) -> None:
+    """Draw the roads with their densities in a window, the devices, and where the UAVs have been, m."""
     draw_roads(axis, evacuation, evacuation.road_density[window])
     draw_sites(axis, evacuation)
     set_limits(axis, evacuation)
-    scale = max(evacuation.region_m()) / max(float(position.max()), 1.0)  # the layout may be a scaled copy of the place
-    tour = np.concatenate([np.zeros((1, 2)), position[episode.action[: slot + 1]]]) * scale
-    axis.plot(*tour.T, color="black", lw=0.6, alpha=0.4, zorder=2)
-    axis.plot(*tour[-2:].T, color="black", lw=1.8, zorder=5)
-    axis.plot(*tour[-1], marker="X", color="black", ms=11, zorder=6)
+    for uav in range(stops.shape[1]):
+        tour = stops[:, uav]
+        colour = "black" if stops.shape[1] == 1 else uav_colour(uav)
+        axis.plot(*tour.T, color=colour, lw=0.6, alpha=0.4, zorder=2)
+        axis.plot(*tour[-2:].T, color=colour, lw=1.8, zorder=5)
+        axis.plot(*tour[-1], marker="X", color=colour, ms=11, zorder=6)
     axis.legend(handles=density_legend(), fontsize=6, loc="lower right", title="vehicles/km/lane", title_fontsize=6)
 
 

@@ -18,6 +18,10 @@ _MEASURES = {
 }
 
 
+_NO_FAILURE = ("none", "horizon", "share")
+"""Causes of an end without which no device failed first, but not for want of a UAV."""
+
+
 def comparison(a: Side, b: Side) -> tuple[dict[str, Table], dict[str, Any]]:
     """Compare two runs; return tables by title, and the same as plain data.
 
@@ -80,10 +84,25 @@ def evaluation_table(rows: list[dict[str, Any]]) -> Table:
         rows: from :func:`uavmec_jax.studies.policy_evaluation.evaluate_policy`.
     """
     table = Table()
-    for column in ("policy", "lifetime, slots", "shortest", "longest", "ends by", "first to fail"):
+    of_service = "service" in rows[0]
+    measured = ("in service",) if of_service else ("lifetime, slots", "shortest", "longest")
+    for column in ("policy", *measured, "ends by", "first to fail"):
         table.add_column(column, justify="left" if column == "policy" else "right")
     for row in rows:
-        mean = Text(f"{row['mean']:.2f}").append(half_interval(row["low"], row["high"]), style="dim")
-        device = first_to_fail(row["first_device"]) + f" {row['first_share']:.0%}" * bool(row["first_device"])
-        table.add_row(row["policy"], mean, str(row["shortest"]), str(row["longest"]), row["cause"], device)
+        numbers = [_service(row)] if of_service else [_lifetime(row), str(row["shortest"]), str(row["longest"])]
+        device = "none" if row["cause"] in _NO_FAILURE else "UAV"
+        if row["first_device"]:
+            device = f"{first_to_fail(row['first_device'])} {row['first_share']:.0%}"
+        table.add_row(row["policy"], *numbers, row["cause"], device)
     return table
+
+
+def _lifetime(row: dict[str, Any]) -> Text:
+    text = Text(f"{row['mean']:.2f}").append(half_interval(row["low"], row["high"]), style="dim")
+    return text.append(censored_share(row.get("censored", 0.0)))
+
+
+def _service(row: dict[str, Any]) -> Text:
+    text = Text(f"{row['service']:.1%}")
+    text.append(half_interval(100 * row["service_low"], 100 * row["service_high"]), style="dim")
+    return text.append(censored_share(row["censored"]))

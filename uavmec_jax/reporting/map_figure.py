@@ -1,5 +1,8 @@
 """Maps: the devices of a layout by the resources they have, and the state of an episode as pixels."""
 
+from collections.abc import Sequence
+
+import matplotlib
 import numpy as np
 from jaxtyping import UInt8
 from matplotlib.axes import Axes
@@ -7,6 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from uavmec_jax.env.dynamics import State
+from uavmec_jax.env.fleet import DepotKind
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.scenario import Scenario
 
@@ -17,6 +21,9 @@ _RESOURCES = {
     (False, False): ("tab:red", "has neither"),
 }
 """Power and communication of a device -> its colour, and the label of the colour."""
+
+_MOST_ENERGIES = 5
+"""UAVs whose energies are in the title."""
 
 
 def draw_devices(axis: Axes, layout: Layout) -> None:
@@ -32,13 +39,31 @@ def draw_devices(axis: Axes, layout: Layout) -> None:
     axis.set_ylabel("m north")
 
 
-def map_pixels(scenario: Scenario, state: State, visited: int | None = None) -> UInt8[np.ndarray, "480 640 3"]:
+def uav_colour(uav: int) -> tuple[float, ...]:
+    """Return the colour of a UAV; those of devices are others."""
+    return tuple(matplotlib.colormaps["Dark2"](uav % 8))
+
+
+def draw_depots(axis: Axes, layout: Layout) -> None:
+    """Draw depots as squares, filled where they swap batteries."""
+    if (depots := layout.depots) is None:
+        return
+    swaps = np.asarray(depots.kind) == DepotKind.SWAP
+    for chosen, colour, label in ((swaps, "black", "swap depot"), (~swaps, "white", "charging depot")):
+        if chosen.any():
+            x, y = np.asarray(depots.position)[chosen].T
+            axis.scatter(x, y, s=70, marker="s", color=colour, edgecolors="black", label=label, zorder=2)
+
+
+def map_pixels(
+    scenario: Scenario, state: State, visited: int | Sequence[int] | None = None
+) -> UInt8[np.ndarray, "480 640 3"]:
     """Draw a state of an episode.
 
     Args:
-        scenario: its devices are drawn.
-        state: batteries (written below each device that lacks power), data ages (where communication is missing), UAV.
-        visited: the device just visited, which is ringed.
+        scenario: its devices and depots are drawn.
+        state: batteries (written below each device that lacks power), data ages (where communication is missing), UAVs.
+        visited: the place just visited, for a fleet one per UAV; UAVs are ringed if it is given.
 
     Returns:
         Pixels ``[480, 640, 3]``, RGB.
@@ -53,11 +78,23 @@ def map_pixels(scenario: Scenario, state: State, visited: int | None = None) -> 
         labels += [] if layout.has_comms[device] else [f"age {int(state.age[device])}"]
         text = ", ".join(labels)
         axis.annotate(text, position, xytext=(0, -14), textcoords="offset points", ha="center", fontsize=7)
-    (x, y), energy = np.asarray(state.uav_position)[0], float(np.asarray(state.uav_energy)[0])
-    axis.plot(x, y, marker="X", color="black", ls="", ms=9, alpha=0.7, label="UAV", zorder=4)
-    if visited is not None:
-        axis.plot(x, y, marker="o", mfc="none", mec="black", ls="", ms=18, zorder=4)
-    axis.set_title(f"slot {int(state.slot)}, UAV {energy / 1000:.0f} kJ", fontsize=10)
+    draw_depots(axis, layout)
+    _draw_uavs(axis, state, ringed=visited is not None)
+    energies = ", ".join(f"{energy / 1000:.0f}" for energy in np.asarray(state.uav_energy)[:_MOST_ENERGIES])
+    more = ", ..." * (layout.n_uavs > _MOST_ENERGIES)
+    uavs = "UAV" if layout.n_uavs == 1 else "UAVs"
+    axis.set_title(f"slot {int(state.slot)}, {uavs} {energies}{more} kJ", fontsize=10)
     axis.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1, 1))
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def _draw_uavs(axis: Axes, state: State, *, ringed: bool) -> None:
+    """Draw the UAVs as crosses, pale where they are grounded."""
+    grounded = np.zeros(len(state.uav_energy), bool) if state.grounded is None else np.asarray(state.grounded)
+    for uav, (x, y) in enumerate(np.asarray(state.uav_position)):
+        label = None if uav else "UAV"
+        alpha = 0.25 if grounded[uav] else 0.7
+        axis.plot(x, y, marker="X", color="black", ls="", ms=9, alpha=alpha, label=label, zorder=4)
+        if ringed:
+            axis.plot(x, y, marker="o", mfc="none", mec="black", ls="", ms=18, zorder=4)

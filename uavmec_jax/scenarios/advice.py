@@ -5,14 +5,20 @@ from pathlib import Path
 import jax
 
 from uavmec_jax.planning.advice import Advice, advise
+from uavmec_jax.planning.fleet_demand import is_alone
 from uavmec_jax.scenarios.named_scenario import NamedScenario
 from uavmec_jax.scenarios.policies import TrainedPolicy, load_policy
+
+
+def default_policy(scenario: NamedScenario) -> str:
+    """Return the name of the policy to follow if none is named: one that was trained only for what it was trained on."""
+    return "generalist" if is_alone(scenario.layout) else "earliest-deadline"
 
 
 def advise_on(
     scenario: NamedScenario, policy: str | Path, *, samples: int, what_if: bool, seed: int = 0
 ) -> tuple[Advice, list[str]]:
-    """Recommend the next visit, and warn where the scenario lies outside the policy's training distribution.
+    """Recommend the next visits, and warn where the scenario lies outside the policy's training distribution.
 
     Args:
         scenario: the devices and their present state.
@@ -29,6 +35,7 @@ def advise_on(
     if isinstance(loaded, TrainedPolicy):
         differences = loaded.out_of_distribution(scenario.params, scenario.layout)
         warnings = [f"{scenario.name}: {difference}: {policy} may do worse here" for difference in differences]
+        warnings += [f"{scenario.name}: {line}" for line in loaded.lifted_to(scenario.layout)]
     advice = advise(
         loaded,
         scenario.params,

@@ -70,6 +70,18 @@ class NamedScenario:
         """Names of the UAVs; there is at least one."""
         return self.file.uav_names
 
+    @property
+    def region_corners(self) -> Float[np.ndarray, "m 2"] | None:
+        """Corners of the region in metres, if the file gives it as a polygon."""
+        return find_positions(self.file).corners
+
+    def with_slot_limit(self, slots: int) -> "NamedScenario":
+        """Return the scenario with ``max_slots`` where a depot may let UAVs fly on for ever and the file has no limit."""
+        has_end = self.params.end == "horizon" or "max_slots" in self.file.params.model_fields_set
+        if has_end or not self.depot_names:
+            return self
+        return replace(self, params=replace(self.params, max_slots=slots))
+
     def geographic(self, position: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
         """Convert positions ``[..., 2]`` in metres to longitudes and latitudes.
 

@@ -19,7 +19,9 @@ from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Policy
 from uavmec_jax.errors import PolicyError
 from uavmec_jax.files.validation import suggest
-from uavmec_jax.planning.heuristics import HEURISTICS
+from uavmec_jax.planning.fleet_demand import is_alone
+from uavmec_jax.planning.fleet_rules import for_fleets
+from uavmec_jax.planning.heuristics import FLEET_HEURISTICS
 from uavmec_jax.planning.observation import FEATURES
 from uavmec_jax.planning.rollout_planner import rollout_planner
 from uavmec_jax.scenarios.distribution import out_of_distribution
@@ -92,6 +94,9 @@ class TrainedPolicy:
     def __call__(self, params: Params, layout: Layout, state: State, key: Any = None) -> Int[Array, "*batch"]:
         """Return the device to visit, int32; the state may have any number of batch axes in front.
 
+        The policy decides for one UAV. Several decide in turn by it, and return to depots as rules do (:func:`for_fleets`);
+        the result is then a place for each of them.
+
         Raises:
             PolicyError: the layout has another number of devices.
         """
@@ -99,8 +104,22 @@ class TrainedPolicy:
             raise PolicyError(
                 f"the policy was trained for {self.n_devices} devices; the layout has {layout.capacity.shape[-1]}"
             )
-        action: Array = self._policy(params, layout, state)
-        return action
+        if is_alone(layout):
+            action: Array = self._policy(params, layout, state)
+            return action
+        in_turn: Policy = for_fleets(self)
+        for _ in range(jnp.ndim(state.slot)):
+            in_turn = jax.vmap(in_turn, (None, None, 0))
+        return in_turn(params, layout, state)
+
+    def lifted_to(self, layout: Layout) -> list[str]:
+        """Say in a line how the policy decides for several UAVs or with depots; nothing for one UAV without depots."""
+        if is_alone(layout):
+            return []
+        who = "the UAVs decide in turn by it and" if layout.n_uavs > 1 else "the UAV"
+        return [
+            f"the policy was trained for one UAV without depots; {who} return{'s' * (layout.n_uavs == 1)} by a rule"
+        ]
 
     def act(self, observation: Any) -> Int[np.ndarray, "*batch"]:
         """Return the device to visit, int32, for observations ``[..., obs_size]``.
@@ -151,7 +170,7 @@ def load_policy(source: str | Path, which: str = "best", **axes: Any) -> Policy:
     """Load a policy by name, from a file, or of one agent of a run.
 
     Args:
-        source: ``"generalist"``, a name in :data:`HEURISTICS`, ``"rollout"``, a policy file, or the folder of a run.
+        source: ``"generalist"``, a name in :data:`FLEET_HEURISTICS`, ``"rollout"``, a policy file, or the folder of a run.
         which: ``"best"`` or ``"last"`` weights of a run's agent; a policy file has only one of the two.
         axes: values that select one agent of a run, e.g. ``powered=8, connected=8, seed=3, algorithm="ppo"``; axes on
             which all agents have the same value may be left out.
@@ -163,8 +182,8 @@ def load_policy(source: str | Path, which: str = "best", **axes: Any) -> Policy:
         PolicyError: there is no such policy; its file is damaged, altered or from another version; its weights are not
             finite; or no agent, or more than one, has the given values.
     """
-    if str(source) in HEURISTICS:
-        return HEURISTICS[str(source)]
+    if str(source) in FLEET_HEURISTICS:
+        return FLEET_HEURISTICS[str(source)]
     if str(source) == "rollout":
         return rollout_planner()
     shipped = {Path(file.name).stem: file for file in _SHIPPED.iterdir() if file.name.endswith(".npz")}
@@ -172,7 +191,7 @@ def load_policy(source: str | Path, which: str = "best", **axes: Any) -> Policy:
     if path.is_dir():
         path = path / WEIGHTS
     elif not path.exists() and not path.suffix:
-        hint = suggest(str(source), [*shipped, *HEURISTICS, "rollout"])
+        hint = suggest(str(source), [*shipped, *FLEET_HEURISTICS, "rollout"])
         raise PolicyError(f"{source}: neither a file nor a policy by name; {hint}")
     collection = read_policies(path)
     kinds = {key.split("/")[1] for key in collection.weights}

@@ -4,9 +4,12 @@ from functools import partial
 from typing import Any
 
 import jax
+import numpy as np
 from jaxtyping import Array, Key
 
+from uavmec_jax.env.dynamics import Cause
 from uavmec_jax.env.rollout import Policy, rollouts
+from uavmec_jax.planning.fleet_demand import is_alone
 from uavmec_jax.planning.heuristics import HEURISTICS
 from uavmec_jax.scenarios.named_scenario import NamedScenario
 from uavmec_jax.studies.evaluation_result import EvaluationResult, most_common_cause, most_common_first_device
@@ -31,7 +34,9 @@ def evaluate_policy(
         One dictionary per policy: ``policy``, its name; ``mean`` lifetime in slots with the 95 % interval ``low``, ``high``
         over the draws; ``shortest`` and ``longest`` lifetime; ``lifetimes``, all of them; the most common ``cause`` of
         failure; ``first_device``, the number (from 1) of the device that fails first most often, 0 if none fails; and
-        ``first_share``, its share of the first failures.
+        ``first_share``, its share of the first failures. For several UAVs, depots or a horizon also ``censored``, the share
+        of the episodes that ``max_slots`` cuts off, and for a horizon ``service``, the mean share of the time to it in which
+        the devices are in service, with the interval ``service_low``, ``service_high``.
     """
     policies = {name: policy} | {baseline: HEURISTICS[baseline] for baseline in _BASELINES}
     return [{"policy": label, **_evaluate(each, scenario, draws)} for label, each in policies.items()]
@@ -52,4 +57,16 @@ def _evaluate(policy: Policy, scenario: NamedScenario, draws: Key[Array, " D"]) 
         "cause": most_common_cause(result.cause[0]),
         "first_device": most_common_first_device(share),
         "first_share": float(share.max()),
+        **_fleet_measures(result, scenario),
     }
+
+
+def _fleet_measures(result: EvaluationResult, scenario: NamedScenario) -> dict[str, Any]:
+    """Return what is measured besides where there is more than the paper's one UAV and its end at the first failure."""
+    if is_alone(scenario.layout) and result.service_s is None:
+        return {}
+    censored = {"censored": float(np.mean(result.cause[0] == Cause.NONE))}
+    if result.service_s is None:
+        return censored
+    mean, low, high = mean_interval(result.service_s[0].astype(float) / float(scenario.params.horizon_s))
+    return censored | {"service": mean, "service_low": low, "service_high": high}
