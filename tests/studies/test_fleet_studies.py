@@ -32,11 +32,11 @@ from uavmec_jax.studies.parts import split_study
 from uavmec_jax.studies.places import load_evacuations
 from uavmec_jax.studies.population import (
     cell_axes,
-    clairvoyant_seeds,
     evaluation_keys,
     make_agent_ids,
     make_agents,
     n_agents,
+    n_clairvoyant_seeds,
 )
 from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.results_files import read_results
@@ -126,7 +126,7 @@ def test_a_study_of_one_uav_without_depots_has_no_trace_of_fleets():
 def test_the_shipped_study():
     study = load_study("fleet")
     assert [part.name for part in split_study(study)] == [f"none, uavs={k}" for k in (1, 2, 3)]
-    assert [len(clairvoyant_seeds(part.study)) for part in split_study(study)] == [100, 100, 20]
+    assert [n_clairvoyant_seeds(part.study) for part in split_study(study)] == [100, 100, 20]
     agents = make_agents(split_study(study)[2].study, agent_ids=make_agent_ids(split_study(study)[2].study)[:2])
     assert (agents.scenario.layout.n_uavs, agents.scenario.layout.n_depots) == (3, 1)
 
@@ -236,7 +236,7 @@ def episodes_of(lifetimes):
 
 def test_beam_and_bound_are_evaluated_for_some_agents_only(study, monkeypatch):
     part = split_study(parse_study(TOML, "x", {"evaluation.clairvoyant_seeds": [1, 0]}))[0].study
-    assert (clairvoyant_seeds(part), clairvoyant_seeds(part.model_copy(update={"uavs": 7}))) == ([0], [])
+    assert (n_clairvoyant_seeds(part), n_clairvoyant_seeds(part.model_copy(update={"uavs": 7}))) == (1, 0)
     asked = []
 
     def beam(params, layouts, keys, **_):

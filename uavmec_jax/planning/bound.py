@@ -125,7 +125,8 @@ class _Bound:
         flights = np.array([self._rounds.min_distance(survive)]) if instance.uavs == 1 else self._nearest
         if instance.depots is not None:
             levels = add_depot_rows(rows, instance, instance.depots, flights)
-            return rows.build(np.full(slots, instance.uavs), levels)
+            seconds = endurance(instance, np.zeros(instance.uavs))
+            return rows.build(np.sum(shortest[:slots, None] <= seconds, axis=1), levels)
         seconds = endurance(instance, flights)
         largest = np.sum(np.cumsum(shortest[:slots])[:, None] <= seconds, axis=1)
         if (largest[:paid] < 1).any():

@@ -5,7 +5,7 @@ power. UAVs with different powers then have one unit.
 """
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from uavmec_jax.env.fleet import DepotKind, Depots
 from uavmec_jax.planning.bound_instance import SLACK, Instance
@@ -31,10 +31,7 @@ def add_endurance_rows(rows: Rows, seconds: Float[np.ndarray, " K"], paid: int) 
 
 
 def add_depot_rows(rows: Rows, instance: Instance, depots: Depots, flights: Float[np.ndarray, " K"]) -> int:
-    """Add the rows of a fleet with depots.
-
-    The level of a slot is the energy in all batteries when it begins, as a share of their capacity; before the first slot
-    it is 1, before any other a variable.
+    """Add the rows of a fleet with depots: for all UAVs, and if their batteries differ, for those with the worst ones.
 
     Args:
         rows: where to.
@@ -43,23 +40,50 @@ def add_depot_rows(rows: Rows, instance: Instance, depots: Depots, flights: Floa
         flights: m that each UAV flies at least.
 
     Returns:
-        The number of variables.
+        The number of variables of the rows.
     """
     seconds = endurance(instance, np.zeros(instance.uavs))
-    total, slots, sizes = seconds.sum(), rows.features.slots, rows.features.sizes
-    if not np.isfinite(total):
+    if not np.isfinite(seconds.sum()):
         return 0
     flown = np.sum(instance.extra_power * flights / instance.speed / instance.base_power) * (1.0 - SLACK)
-    refill, charge, packs = _refills(instance, depots, seconds, sizes)
-    slot, size = np.indices((slots, sizes))
+    levels = _add_levels(rows, instance, depots, seconds, float(flown), 0)
+    for others in range(1, rows.features.sizes - 1):
+        if seconds[others - 1] > seconds[others] * (1.0 + SLACK):
+            levels += _add_levels(rows, instance, depots, seconds[others:], 0.0, levels)
+    return levels
+
+
+def _add_levels(
+    rows: Rows, instance: Instance, depots: Depots, seconds: Float[np.ndarray, " some"], flown: float, first: int
+) -> int:
+    """Add the rows for the UAVs with the worst batteries, of which no more than the others hover without them.
+
+    The level of a slot is the energy in their batteries when it begins, as a share of their capacity; before the first slot
+    it is 1, before any other a variable.
+
+    Args:
+        rows: where to.
+        instance: the scenario.
+        depots: its depots.
+        seconds: :func:`endurance` of their batteries.
+        flown: s of hovering that their flights cost in total.
+        first: number of the first variable.
+
+    Returns:
+        The number of variables.
+    """
+    total, slots, sizes = seconds.sum(), rows.features.slots, np.arange(rows.features.sizes)
+    landed = np.minimum(instance.uavs - sizes, len(seconds))
+    refill, charge, packs = _refills(instance, depots, seconds, landed)
+    slot, size = np.indices((slots, len(sizes)))
     places, use = rows.features.seconds(slot, size), rows.features.use(slot, size)
-    spent, gained = size / total, -refill[:slots] / total
+    spent, gained = np.maximum(size - (instance.uavs - len(seconds)), 0) / total, -refill[:slots] / total
     for number in range(slots):
-        level = {number - 1: -1.0} if number else {}
+        level = {first + number - 1: -1.0} if number else {}
         limit = 0.0 if number else 1.0
         rows.add(limit, (places[number], spent[number]), levels=level)
         if number < slots - 1:
-            level = level | {number: 1.0}
+            level = level | {first + number: 1.0}
             rows.add(limit, (places[number], spent[number]), (use[number], gained[number]), levels=level)
     every_slot = places.ravel(), spent.ravel()
     if flown > 0.0:
@@ -71,9 +95,9 @@ def add_depot_rows(rows: Rows, instance: Instance, depots: Depots, flights: Floa
 
 
 def _refills(
-    instance: Instance, depots: Depots, seconds: Float[np.ndarray, " K"], sizes: int
+    instance: Instance, depots: Depots, seconds: Float[np.ndarray, " some"], landed: Int[np.ndarray, " sizes"]
 ) -> tuple[Float[np.ndarray, "H sizes"], Float[np.ndarray, "H sizes"], float]:
-    """Return what depots give at most in each slot with a hover set of each size; the UAVs above no hover point are there.
+    """Return what depots give at most in each slot in which so many of some UAVs have landed.
 
     Returns:
         What they give in total; the same without swaps; and the number of swaps for which there are packs.
@@ -84,7 +108,6 @@ def _refills(
     power = depots.power_w.max(initial=0.0, where=charges) / instance.base_power.min()
     charge = np.minimum(seconds, power * _longest_slots(instance, depots)[:, None])
     by_swaps, by_charges = (np.pad(np.cumsum(value, axis=-1), ((0, 0), (1, 0))) for value in (seconds[None], charge))
-    landed = np.arange(instance.uavs, instance.uavs - sizes, -1)
     swapped = np.minimum(landed, np.sum(np.floor(depots.pads[packs >= 1]))).astype(int)
     pads = np.sum(np.floor(depots.pads[charges]))
     others, all_charged = (np.minimum(count, pads).astype(int) for count in (landed - swapped, landed))

@@ -18,11 +18,12 @@ from uavmec_jax.studies.evaluation_result import EvaluationResult
 from uavmec_jax.studies.parts import Part, split_study
 from uavmec_jax.studies.population import (
     AgentId,
-    clairvoyant_seeds,
     evaluation_keys,
     make_agent_ids,
     make_agents,
     make_algorithm,
+    n_clairvoyant_seeds,
+    seeds_of,
     validation_keys,
 )
 from uavmec_jax.studies.schema import Study
@@ -116,7 +117,7 @@ class _PartRunner:
         members, keys = jax.tree.map(lambda leaf: leaf[: shard.agents], (agents, keys))
         rows = pd.DataFrame(agent_ids[: shard.agents])
         distinct = DistinctScenarios.of(rows[_scenario_columns(rows)])
-        clairvoyant = rows["seed"].isin(clairvoyant_seeds(self.study)).to_numpy()
+        clairvoyant = rows["seed"].isin(seeds_of(self.study)[: n_clairvoyant_seeds(self.study)]).to_numpy()
         for name, value in reversed(self.part.values.items()):
             rows.insert(min(3, rows.shape[1]), name, value)
         weights: dict[str, Any] = {}

@@ -13,7 +13,7 @@ from uavmec_jax.runs.options import RunOptions
 from uavmec_jax.runs.run_plan import RunPlan
 from uavmec_jax.studies.axes import TRACED_PARAMS
 from uavmec_jax.studies.parts import split_study
-from uavmec_jax.studies.population import n_agents
+from uavmec_jax.studies.population import n_agents, n_clairvoyant_seeds, n_seeds
 from uavmec_jax.studies.schema import Study
 
 # Measured on two cores of a laptop-sized machine; see results/simulation.
@@ -22,7 +22,9 @@ _START_S = 4.0
 _COMPILE_S = {"training": 9.0, "evaluation": 8.0, "planners": 9.0}
 """Compilation of one algorithm's programs."""
 _PLANNING_S = 0.035
-"""Rollout planner, beam and bound, for one draw of one scenario."""
+"""Rollout planner, beam and bound, for one draw of one scenario with one UAV; about K**3 times as long for K UAVs."""
+_CLAIRVOYANT_SHARE = 0.75
+"""Share of this time that beam and bound take."""
 _PROCESS_BYTES = 900e6
 """A process with its compiled programs."""
 _COPIES = 3
@@ -106,7 +108,8 @@ def simulate(
         if evaluation.planners:
             draws = min(evaluation.planner_draws, evaluation.draws)
             share_of_worker = min(rounds * partition.shard_size / members, 1.0)
-            other += _COMPILE_S["planners"] + _PLANNING_S * _distinct_scenarios(part.study) * draws * share_of_worker
+            planned = _distinct_scenarios(part.study) * draws * share_of_worker
+            other += _COMPILE_S["planners"] + _planning_s(part.study) * planned
         if evaluation.baselines or steps:
             other += _COMPILE_S["evaluation"]
         result_bytes, episode_bytes = _agent_bytes(part.study)
@@ -132,6 +135,12 @@ def _checkpoint_files(options: RunOptions, size: float, shard_s: float) -> int:
 
 
 _SCENARIO_AXES = ("seeds", "powered", "connected", "cells", "place", *TRACED_PARAMS)
+
+
+def _planning_s(study: Study) -> float:
+    """Return the mean seconds that the planners take for one draw of one scenario in one part of a study."""
+    left_out = 1 - n_clairvoyant_seeds(study) / n_seeds(study)
+    return _PLANNING_S * study.uavs**3 * (1 - _CLAIRVOYANT_SHARE * left_out)
 
 
 def _distinct_scenarios(study: Study) -> int:

@@ -38,10 +38,16 @@ def seeds_of(study: Study) -> list[int]:
     return list(range(seeds)) if isinstance(seeds, int) else list(seeds)
 
 
-def clairvoyant_seeds(study: Study) -> list[int]:
-    """Return the seeds that beam and bound are evaluated on, of one part of a study."""
-    numbers, seeds = study.evaluation.clairvoyant_seeds, seeds_of(study)
-    return seeds if numbers is None else seeds[: numbers[min(study.uavs, len(numbers)) - 1]]
+def n_seeds(study: Study) -> int:
+    """Return the number of seeds of a study without making them."""
+    seeds = study.axes["seeds"]
+    return seeds if isinstance(seeds, int) else len(seeds)
+
+
+def n_clairvoyant_seeds(study: Study) -> int:
+    """Return the number of seeds, from the first on, that beam and bound are evaluated on in one part of a study."""
+    numbers = study.evaluation.clairvoyant_seeds
+    return n_seeds(study) if numbers is None else min(n_seeds(study), numbers[min(study.uavs, len(numbers)) - 1])
 
 
 def cell_axes(study: Study) -> list[str]:
@@ -90,8 +96,7 @@ def n_agents(study: Study) -> int:
     others = [values for name, values in study.axes.items() if name not in ("seeds", "reward", "guard")]
     rewards, guards = study.axes.get("reward", [study.reward]), study.axes.get("guard", [study.guard])
     pairs = sum(len(guards) if needs_guard(reward) else 1 for reward in rewards)
-    seeds = study.axes["seeds"]
-    return math.prod(len(values) for values in others) * pairs * (seeds if isinstance(seeds, int) else len(seeds))
+    return math.prod(len(values) for values in others) * pairs * n_seeds(study)
 
 
 def make_algorithm(study: Study) -> Algorithm | None:
