@@ -6,19 +6,20 @@ Batteries are therefore served by least laxity: the one that needs the most serv
 loses no service as long as any order does not (McNaughton 1959).
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from uavmec_jax.env.dynamics import State, initial_state, slots_to_expiry
-from uavmec_jax.env.layout import Layout, fleet_of
+from uavmec_jax.env.dynamics import State, complete_state, initial_state, slots_to_expiry
+from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.planning import demand, fleet_demand
 from uavmec_jax.planning.deadlines import earliest_deadline as of_one_uav
 from uavmec_jax.planning.deadlines import feasible_horizon
-from uavmec_jax.planning.fleet_rules import Choice, in_turn
+from uavmec_jax.planning.fleet_rules import Choice, in_turn, see_living, with_uav
 from uavmec_jax.planning.returns import plan_returns
 
 _TIE_PER_M = 1e-6
@@ -50,15 +51,18 @@ def earliest_deadline(params: Params, layout: Layout, state: State, key: PRNGKey
     A UAV that nothing needs serves the battery with the least left over, or returns to a depot if its own runs low. With one
     UAV and no depots the rule is :func:`deadlines.earliest_deadline`.
     """
+    state = complete_state(layout, state)
+    living, seen = _see_living(params, layout, state)
     if fleet_demand.is_alone(layout):
-        return of_one_uav(params, layout, state, key)
-    fleet, needs = fleet_of(params, layout), _needs(params, layout, state)
-    servers = jnp.sum(~state.grounded)
+        return of_one_uav(with_uav(params, layout, 0), living, seen, key)
+    needs = _needs(params, living, seen)
+    returns = plan_returns(params, layout, state, needs.slots)
+    servers = jnp.sum(~state.grounded if returns is None else ~state.grounded & ~returns.stays)
 
     def choose(uav: Int[Array, ""], served: Bool[Array, " n"], undecided: Bool[Array, " K"]) -> Choice:
-        return _choose(layout, state, needs, uav, served, servers, jnp.sum(undecided))
+        return _choose(living, seen, needs, uav, served, servers, jnp.sum(undecided))
 
-    return in_turn(params, layout, fleet, state, plan_returns(params, layout, fleet, state), choose)
+    return in_turn(params, layout, state, returns, choose)
 
 
 def split_deadline(params: Params, layout: Layout, state: State, key: PRNGKeyArray | None = None) -> Array:
@@ -67,9 +71,13 @@ def split_deadline(params: Params, layout: Layout, state: State, key: PRNGKeyArr
     The devices are split among the UAVs that still fly (:func:`split_among`).
     """
     if fleet_demand.is_alone(layout):
-        return of_one_uav(params, layout, state, key)
-    fleet, needs = fleet_of(params, layout), _needs(params, layout, state)
-    owner = split_among(params, layout, ~state.grounded)
+        return earliest_deadline(params, layout, state, key)
+    state = complete_state(layout, state)
+    living, seen = _see_living(params, layout, state)
+    needs = _needs(params, living, seen)
+    returns = plan_returns(params, layout, state, needs.slots)
+    flies = ~state.grounded if returns is None else ~state.grounded & ~(returns.stays | returns.must)
+    owner = split_among(params, living, flies)
 
     def choose(uav: Int[Array, ""], served: Bool[Array, " n"], undecided: Bool[Array, " K"]) -> Choice:
         mine = owner == uav
@@ -77,9 +85,17 @@ def split_deadline(params: Params, layout: Layout, state: State, key: PRNGKeyArr
             expires_in=jnp.where(mine, needs.expires_in, demand.NEVER),
             services=jnp.where(mine, needs.services, -jnp.inf),
         )
-        return _choose(layout, state, own, uav, served, jnp.int32(1), jnp.int32(0))
+        return _choose(living, seen, own, uav, served, jnp.int32(1), jnp.int32(0))
 
-    return in_turn(params, layout, fleet, state, plan_returns(params, layout, fleet, state), choose)
+    return in_turn(params, layout, state, returns, choose)
+
+
+def _see_living(params: Params, layout: Layout, state: State) -> tuple[Layout, State]:
+    """Return what :func:`see_living` does, with data that have expired at the limit: how long ago makes no difference."""
+    living, seen = see_living(params, layout, state)
+    if params.end == "first_failure":
+        return living, seen
+    return living, replace(seen, age=jnp.minimum(seen.age, slots_to_expiry(params)))
 
 
 def split_among(params: Params, layout: Layout, flies: Bool[Array, " K"]) -> Int[Array, " n"]:
