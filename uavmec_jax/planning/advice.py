@@ -20,7 +20,7 @@ from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Episode, Policy, rollout_from, trace_from
 from uavmec_jax.planning.changes import WhatIf, every_change, rank_changes
 from uavmec_jax.planning.forecast import SAMPLES, Forecast
-from uavmec_jax.planning.rollout_planner import candidates_of, prefer, try_candidates
+from uavmec_jax.planning.rollout_planner import candidates_of, prefer, try_candidates, values_of
 
 _RETURN_SAMPLES = 32
 """Futures in which it is looked up when the UAVs return to a depot."""
@@ -37,8 +37,9 @@ class Candidate:
         device: index of the place from 0: a device, or behind the devices a depot.
         lifetime: slots, mean over the futures if the UAV flies there next and the policy decides from then on.
         behind: slots by which the best candidate's value exceeds this one's on the same futures. The value of a future is
-            its lifetime minus the price of its first failure, if the layout's traffic has prices. With
-            ``end = "horizon"`` it is the share of the time to the horizon in which the devices are in service.
+            its lifetime minus the price of its first failure, if the layout's traffic has prices. For a fleet the last slot
+            counts up to the first failure in it. With ``end = "horizon"`` the value is the share of the time to the horizon
+            in which the devices are in service.
         behind_low, behind_high: 95 % confidence interval of that difference over the futures.
     """
 
@@ -133,9 +134,10 @@ def advise(
     for uav in range(layout.n_uavs):
         choice, candidates, episodes = _try_candidates(policy, params, layout, state, futures, action, np.int32(uav))
         lifetimes, value = np.asarray(episodes.length, float), _values(params, layout, state, episodes)
+        unit = float(params.slot_cap_s / params.horizon_s) if params.end == "horizon" else 1.0
         mine = int(np.atleast_1d(choice)[uav])
         best = int(np.argmax(prefer(mine, value.mean(axis=1))))
-        uavs.append(UavAdvice(candidates=_rank(lifetimes, value, best), policy_choice=mine))
+        uavs.append(UavAdvice(candidates=_rank(lifetimes, unit * value, best), policy_choice=mine))
         action = candidates[best]
     if layout.n_depots:
         returns_in = np.asarray(_returns_in(policy, params, layout, state, futures[:_RETURN_SAMPLES], action))
@@ -152,11 +154,11 @@ def advise(
 
 
 def _values(params: Params, layout: Layout, state: State, episodes: Episode) -> Float[np.ndarray, "C S"]:
-    """Return the value of each future of each candidate; see :class:`Candidate`."""
+    """Return the value of each future of each candidate in slots; see :class:`Candidate`."""
+    values = np.asarray(values_of(params, layout, episodes), float)
     if params.end == "horizon":
-        return np.asarray(episodes.service_s) / float(params.horizon_s)
-    price = np.asarray(layout.failure_price(state.elapsed))
-    return np.asarray(episodes.length, float) - np.asarray(episodes.first_failure) @ price
+        return values
+    return values - np.asarray(episodes.first_failure) @ np.asarray(layout.failure_price(state.elapsed))
 
 
 @partial(jax.jit, static_argnames="policy")

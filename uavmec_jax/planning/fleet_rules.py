@@ -37,9 +37,7 @@ Chooser = Callable[[Int[Array, ""], Bool[Array, " n"], Bool[Array, " K"]], Choic
 """``(UAV, devices served so far, UAVs that have not decided yet) -> Choice``."""
 
 
-def in_turn(
-    params: Params, layout: Layout, state: State, returns: Returns | None, choose: Chooser
-) -> Int[Array, "*K"]:
+def in_turn(params: Params, layout: Layout, state: State, returns: Returns | None, choose: Chooser) -> Int[Array, "*K"]:
     """Let the UAVs decide in turn and return the action: those that have to return to a depot do, the others choose."""
     covers = coverage_by_uav(params, layout)
     n, uavs = layout.n_devices, layout.n_uavs
@@ -64,9 +62,7 @@ def in_turn(
     return jax.lax.scan(decide, start, jnp.arange(uavs))[1]
 
 
-def coverage_by_uav(
-    params: Params, layout: Layout
-) -> Callable[[Int[Array, ""], Int[Array, ""]], Bool[Array, " n"]]:
+def coverage_by_uav(params: Params, layout: Layout) -> Callable[[Int[Array, ""], Int[Array, ""]], Bool[Array, " n"]]:
     """Return the function ``(UAV, device) -> devices that it serves from above that device``."""
     fleet = fleet_of(params, layout)
 
@@ -106,7 +102,10 @@ def for_fleets(rule: Policy) -> Policy:
 
 
 def see_living(params: Params, layout: Layout, state: State) -> tuple[Layout, State]:
-    """Return layout and state with the devices that are out for good as padding; as they are if the first failure ends all."""
+    """Return layout and state with the devices that are out for good as padding.
+
+    If the first failure ends the episode there are none, and both stay what they are.
+    """
     present = living_devices(params, layout, state)
     if present is None:
         return layout, state

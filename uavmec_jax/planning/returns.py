@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from uavmec_jax.env.channel import upload_rate
 from uavmec_jax.env.depots import can_help, stands_at
-from uavmec_jax.env.dynamics import State
+from uavmec_jax.env.dynamics import State, slots_to_expiry
 from uavmec_jax.env.fleet import DepotKind, Depots, Fleet
 from uavmec_jax.env.layout import Layout, fleet_of
 from uavmec_jax.env.params import Params
@@ -31,6 +31,7 @@ class Returns(NamedTuple):
 
     Attributes:
         distance: m, from each UAV to each depot that can help and that its energy reaches; infinite to the others.
+        away: slots that each UAV is about to spend on returning: before the data that are fresh now expire.
         full: UAVs to which depots give nothing.
         stays: UAVs that stand at a depot, which goes on charging or swapping their battery.
         urgent: UAVs that return now, whether a pad is free or not.
@@ -42,6 +43,7 @@ class Returns(NamedTuple):
     """
 
     distance: Float[Array, "K D"]
+    away: Float[Array, " K"]
     full: Bool[Array, " K"]
     stays: Bool[Array, " K"]
     urgent: Bool[Array, " K"]
@@ -52,55 +54,46 @@ class Returns(NamedTuple):
     packs: Float[Array, " D"]
 
 
-def plan_returns(
-    params: Params, layout: Layout, state: State, slots_to_go: ArrayLike = jnp.inf
-) -> Returns | None:
+def plan_returns(params: Params, layout: Layout, state: State, slots_to_go: ArrayLike = jnp.inf) -> Returns | None:
     """Return who returns to a depot in this slot; ``None`` without depots.
 
-    A UAV whose energy lasts for ``slots_to_go`` slots, that is, to the end, does not.
+    A UAV whose energy lasts for ``slots_to_go`` slots, that is, to the end, does not have to.
     """
     if layout.depots is None:
         return None
-    fleet, depots, energy = fleet_of(params, layout), layout.depots, state.uav_energy
+    fleet, depots, energy, flies = fleet_of(params, layout), layout.depots, state.uav_energy, ~state.grounded
     helps = can_help(depots, state.packs) & _is_first_of_its_place(depots)
-    per_metre = fleet.flying_power_w / fleet.speed_m_s
     distance = jnp.linalg.norm(state.uav_position[:, None] - depots.position, axis=-1)
-    reaches = helps & (energy[:, None] >= per_metre[:, None] * distance) & ~state.grounded[:, None]
-    distance = jnp.where(reaches, distance, jnp.inf)
-    full = energy >= fleet.battery_j
-
+    affordable = energy[:, None] >= fleet.flying_power_w[:, None] * distance / fleet.speed_m_s[:, None]
+    distance = jnp.where(helps & affordable & flies[:, None], distance, jnp.inf)
     way_back = jnp.linalg.norm(layout.position[:, None] - depots.position, axis=-1)
     way_back = jnp.min(jnp.where(helps, way_back, jnp.inf), axis=1)
-    farthest = jnp.max(jnp.where(_present(layout) & jnp.isfinite(way_back), way_back, 0.0))
     longest = _longest_slot(params, layout, fleet, state, helps)
-    lasts = lambda energy: (energy - 2.0 * per_metre * farthest) / (fleet.hovering_power_w * longest)  # noqa: E731
-    wants = jnp.any(reaches, axis=1) & ~full
-    slots_left = jnp.where(wants, jnp.maximum(lasts(energy), 0.0), jnp.inf)
-    wants &= slots_left < slots_to_go
-    slots_left = jnp.where(wants, slots_left, jnp.inf)
 
-    # In the order of their energy, `together` UAVs per turn: the first ones go if a later one would otherwise be too late.
-    flying = jnp.sum(~state.grounded)
-    together = jnp.clip(jnp.sum(jnp.where(helps, depots.pads, 0.0)), 1, jnp.maximum(1, flying // 4))
-    refill = _refill_slots(params, fleet, depots)[jnp.arange(layout.n_uavs), jnp.argmin(distance, axis=1)]
-    refill = jnp.max(jnp.where(wants, refill, 1.0))
-    full_lasts = jnp.min(jnp.where(state.grounded, jnp.inf, lasts(fleet.battery_j)))
-    refill = jnp.clip(refill, 1.0, jnp.maximum(1.0, full_lasts / jnp.maximum(flying, 1)))
+    full = energy >= fleet.battery_j
+    slots_left = jnp.maximum(_lasts(layout, fleet, energy, way_back, longest), 0.0)
+    wants = jnp.isfinite(jnp.min(distance, axis=1)) & ~full & (slots_left < slots_to_go)
+    slots_left = jnp.where(wants, slots_left, jnp.inf)
+    full_lasts = jnp.where(flies, _lasts(layout, fleet, fleet.battery_j, way_back, longest), jnp.inf)
+    most = jnp.maximum(jnp.min(full_lasts) / jnp.maximum(jnp.sum(flies), 1), 1.0)
+    refill = jnp.clip(jnp.max(jnp.where(wants, _refill_slots(params, fleet, depots, distance), 1.0)), 1.0, most)
+    together = jnp.clip(jnp.sum(jnp.where(helps, depots.pads, 0.0)), 1, jnp.maximum(1, jnp.sum(flies) // 4))
+    # So many UAVs a turn, in the order of their energy: the first ones go if a later one would otherwise be too late.
     turn = jnp.floor(_rank(slots_left) / together) * refill
-    tight = jnp.any(wants & (slots_left < turn + 1.0))
-    urgent = wants & (slots_left < 1.0)
+    urgent, tight = slots_left < 1.0, jnp.any(slots_left < turn + 1.0)
 
     packs = jnp.where(depots.kind == DepotKind.SWAP, jnp.floor(state.packs), jnp.inf)
     low = wants & (energy < _LEAVE_AT * fleet.battery_j)
-    gets = stands_at(depots, state.uav_position) & reaches & low[:, None]
+    gets = stands_at(depots, state.uav_position) & jnp.isfinite(distance) & low[:, None]
     gets &= jnp.cumsum(gets, axis=0) <= jnp.minimum(depots.pads, packs)
     return Returns(
         distance=distance,
+        away=jnp.where(slots_left < turn + 1.0 + slots_to_expiry(params), refill, 0.0),
         full=full,
         stays=jnp.any(gets, axis=1),
         urgent=urgent,
         must=urgent | (wants & tight & (turn < 1.0)),
-        may=wants & (slots_left < _TOP_UP_SLOTS),
+        may=slots_left < _TOP_UP_SLOTS,
         safe=_safe(params, layout, fleet, state, longest, way_back),
         pads=depots.pads - jnp.sum(gets, axis=0),
         packs=packs - jnp.sum(gets, axis=0),
@@ -131,9 +124,7 @@ def send(
     depot = jnp.where(is_vacant, jnp.argmin(vacant), jnp.argmin(stocked))
     takes = goes & ~returns.stays[uav] & (jnp.arange(distance.shape[0]) == depot)
     depot = jnp.where(returns.stays[uav], jnp.argmin(distance), depot)
-    place = jnp.where(
-        goes | returns.stays[uav], layout.n_devices + depot, jnp.where(instead, nearest_safe, device)
-    )
+    place = jnp.where(goes | returns.stays[uav], layout.n_devices + depot, jnp.where(instead, nearest_safe, device))
     return place.astype(jnp.int32), returns._replace(pads=returns.pads - takes, packs=returns.packs - takes)
 
 
@@ -164,10 +155,20 @@ def _longest_slot(
     return jnp.maximum(params.slot_cap_s + t_results, t_fly + t_upload)
 
 
-def _refill_slots(params: Params, fleet: Fleet, depots: Depots) -> Float[Array, "K D"]:
-    """Return the slots that each UAV spends at each depot: one to swap its battery, more to charge it."""
-    charging = _LEAVE_AT * fleet.battery_j[:, None] / (depots.power_w * params.slot_cap_s)
-    return jnp.where(depots.kind == DepotKind.SWAP, 1.0, jnp.ceil(charging))
+def _lasts(
+    layout: Layout, fleet: Fleet, energy: Float[Array, " K"], way_back: Float[Array, " n"], longest: Float[Array, ""]
+) -> Float[Array, " K"]:
+    """Return the slots of ``longest`` s that an energy pays for, less that for the way to and from the farthest device."""
+    farthest = jnp.max(jnp.where(_present(layout) & jnp.isfinite(way_back), way_back, 0.0))
+    kept = 2.0 * fleet.flying_power_w * farthest / fleet.speed_m_s
+    return (energy - kept) / (fleet.hovering_power_w * longest)
+
+
+def _refill_slots(params: Params, fleet: Fleet, depots: Depots, distance: Float[Array, "K D"]) -> Float[Array, " K"]:
+    """Return the slots that each UAV spends at its nearest depot: one to swap its battery, more to charge it."""
+    charging = jnp.ceil(_LEAVE_AT * fleet.battery_j[:, None] / (depots.power_w * params.slot_cap_s))
+    slots = jnp.where(depots.kind == DepotKind.SWAP, 1.0, charging)
+    return jnp.take_along_axis(slots, jnp.argmin(distance, axis=1)[:, None], axis=1)[:, 0]
 
 
 def _safe(
