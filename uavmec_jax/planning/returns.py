@@ -151,7 +151,7 @@ def _longest_slot(
     extent = jnp.linalg.norm(jnp.max(highest, axis=0) - jnp.min(lowest, axis=0))
     slant = jnp.minimum(jnp.max(jnp.where(flies, fleet.signal_range_m, 0.0)), jnp.hypot(extent, params.uav_altitude_m))
     slant = jnp.maximum(slant, params.uav_altitude_m)
-    t_upload = 8.0 * params.task_volume_range_bytes[1] / upload_rate(params, slant)
+    t_upload = 8.0 * params.task_volume_range_bytes[1] / upload_rate(params, slant[None])[0]
     return jnp.maximum(params.slot_cap_s + t_results, t_fly + t_upload)
 
 
