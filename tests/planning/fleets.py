@@ -15,7 +15,20 @@ def stack(trees):
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
 
 
-def town(seed, *, uavs=4, flying=None, devices=8, padding=0, depots=None, powered=4, connected=4, unequal=False, **changes):
+def town(
+    seed,
+    *,
+    uavs=4,
+    flying=None,
+    devices=8,
+    padding=0,
+    depots=None,
+    powered=4,
+    connected=4,
+    unequal=False,
+    more_depots=0,
+    **changes,
+):
     """Return parameters and layout of a random town.
 
     Args:
@@ -27,6 +40,7 @@ def town(seed, *, uavs=4, flying=None, devices=8, padding=0, depots=None, powere
         depots: see :func:`make_depots`; ``None`` for none.
         powered, connected: numbers of devices.
         unequal: whether UAVs differ in all that they can differ in.
+        more_depots: padding behind the depots.
         changes: of the parameters.
     """
     rng = np.random.default_rng(seed)
@@ -36,8 +50,11 @@ def town(seed, *, uavs=4, flying=None, devices=8, padding=0, depots=None, powere
         name: getattr(params, f"uav_{name}") * np.exp(rng.uniform(-0.4, 0.4, uavs) if unequal else np.zeros(uavs))
         for name in ("speed_m_s", "flying_power_w", "hovering_power_w", "battery_j", "signal_range_m")
     }
-    present = None if flying is None else np.arange(uavs) < flying
-    layout = layout.replace(fleet=make_fleet(params, uavs, depots, present=present, **factors), depots=depots)
+    if flying is not None:
+        factors["present"] = np.arange(uavs) < flying
+    layout = layout.replace(fleet=make_fleet(params, uavs, depots, **factors), depots=depots)
+    if more_depots:
+        layout = layout.replace(depots=with_padding(depots, more_depots))
     if padding:
         params = params.replace(n_devices=devices + padding)
         layout = pad_layout(layout, devices + padding)
@@ -65,7 +82,9 @@ def mid_life(seed, params, layout, least=0.02):
     grounded = np.asarray(start.grounded) | (rng.random(layout.n_uavs) < 0.1)
     ages = rng.integers(0, 11, layout.n_devices)
     return start.replace(
-        battery=jnp.asarray(layout.capacity * np.where(real, rng.uniform(0.3, 1.0, layout.n_devices), 1.0), jnp.float32),
+        battery=jnp.asarray(
+            layout.capacity * np.where(real, rng.uniform(0.3, 1.0, layout.n_devices), 1.0), jnp.float32
+        ),
         age=jnp.asarray(np.where(layout.has_comms, 0, ages), jnp.int32),
         uav_position=jnp.asarray(position, jnp.float32),
         uav_energy=jnp.asarray(start.uav_energy * rng.uniform(least, 1.0, layout.n_uavs), jnp.float32),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from tests.planning.fleets import mid_life, stack, town, with_padding
+from tests.planning.fleets import mid_life, stack, town
 from uavmec_jax.env.dynamics import initial_state
 from uavmec_jax.env.fleet import make_depots, make_fleet
 from uavmec_jax.env.params import Params
@@ -33,8 +33,8 @@ act = jax.jit(jax.vmap(actions_of, (0, 0, 0, None)))
 
 @cache
 def batch(uavs, depots):
-    """Return 8 scenarios of 10 entries, and a state in the middle of each; half have padding and UAVs that differ."""
-    at = {0: None, 1: DEPOT, 2: TWO_DEPOTS, 3: with_padding(DEPOT, 1)}[depots]
+    """Return 8 scenarios of 10 entries, half with padding, half with UAVs that differ; ``depots=3``: one and padding."""
+    at = {0: None, 1: DEPOT, 2: TWO_DEPOTS, 3: DEPOT}[depots]
     towns = [
         town(
             seed,
@@ -43,6 +43,7 @@ def batch(uavs, depots):
             devices=10 - 3 * (seed % 2),
             padding=3 * (seed % 2),
             depots=at,
+            more_depots=int(depots == 3),
             powered=seed % 5,
             connected=seed % 4,
             unequal=seed % 4 > 1,
@@ -57,7 +58,10 @@ def batch(uavs, depots):
     return stack([params for params, _ in towns]), stack([layout for _, layout in towns]), towns
 
 
-@pytest.mark.parametrize(("uavs", "depots"), [(1, 0), (1, 2), (2, 0), (3, 2), (3, 3)])
+SLOW = [pytest.param(uavs, depots, marks=pytest.mark.slow) for uavs, depots in ((1, 2), (2, 0), (2, 1))]
+
+
+@pytest.mark.parametrize(("uavs", "depots"), [(1, 0), (3, 2), (3, 3), *SLOW])
 def test_actions_are_places_and_not_padding(uavs, depots):
     params, layouts, towns = batch(uavs, depots)
     for moment in (0, 1):
@@ -117,7 +121,7 @@ def test_uavs_choose_different_devices():
 def test_renumbering_devices_renumbers_the_actions():
     """Regions are so wide that no two devices are served together: hover points have no ties."""
     towns = [
-        town(seed, uavs=3, devices=10, depots=TWO_DEPOTS, powered=3, connected=2, region_m=(6000.0, 6000.0))
+        town(seed, uavs=3, flying=3, devices=10, depots=TWO_DEPOTS, powered=3, connected=2, region_m=(6000.0, 6000.0))
         for seed in range(8)
     ]
     towns = [(params, layout.replace(present=jnp.ones(10, bool))) for params, layout in towns]
@@ -143,6 +147,7 @@ def test_renumbering_devices_renumbers_the_actions():
         assert_array_equal(np.take_along_axis(old_number, np.asarray(after[name]), axis=1), before[name], err_msg=name)
 
 
+@pytest.mark.slow
 def test_a_large_fleet_serves_many_devices():
     params, layout = town(0, uavs=20, devices=40, depots=DEPOT, powered=10, connected=10, unequal=True)
     state = mid_life(0, params, layout)
@@ -151,7 +156,7 @@ def test_a_large_fleet_serves_many_devices():
     for name in NAMES:
         action = np.asarray(actions[name])
         assert action.shape == (20,), name
-        assert (action >= 0).all() and (action <= 40).all(), name
+        assert np.isin(action, np.arange(41)).all(), name
         devices = action[flying & (action < 40)]
         if name != "random":
             assert len(set(devices)) >= 0.9 * len(devices), name
@@ -161,15 +166,14 @@ def test_a_state_that_leaves_fields_out_is_completed():
     params, layout = town(0, uavs=2, depots=DEPOT)
     state = initial_state(params, layout)
     short = state.replace(grounded=None, failed_at=None, packs=None)
-    for name in ("oldest-first", "earliest-deadline", "split-deadline"):
-        assert_array_equal(HEURISTICS.get(name, FLEET_HEURISTICS[name])(params, layout, short), 0 * 0 + np.asarray(
-            FLEET_HEURISTICS[name](params, layout, state)))
+    decide = jax.jit(HEURISTICS["oldest-first"])
+    assert_array_equal(decide(params, layout, short), decide(params, layout, state))
 
 
 class TestDeadDevices:
     """Where episodes go on after a failure, devices that are out for good are nobody's business."""
 
-    @pytest.mark.parametrize("uavs", [1, 2])
+    @pytest.mark.parametrize("uavs", [pytest.param(1, marks=pytest.mark.slow), 2])
     def test_they_are_not_visited(self, uavs):
         params, layout = town(3, uavs=uavs, devices=8, powered=2, connected=2, end="horizon")
         layout = layout.replace(present=jnp.ones(8, bool))
@@ -208,35 +212,40 @@ class TestSplit:
         owner = jax.jit(split_among)(params, layout, jnp.array(flies))
         return layout, np.asarray(owner)
 
-    def test_every_uav_has_its_share(self):
+    def test_shares_are_equal_where_devices_are(self):
+        """Data alone: each hover point needs as many visits as any other."""
         for seed in range(6):
-            layout, owner = self.split(seed, [True, True, True], powered=0, connected=0)
-            # Each device needs a visit in every 11 slots, or more often if it is out of power: no more than a few times.
-            shares = np.bincount(owner, minlength=3)
-            assert shares.min() >= 2
-            assert shares.max() <= 7
+            _, owner = self.split(seed, [True] * 3, powered=12, connected=0, uav_signal_range_m=1.0)
+            assert sorted(np.bincount(owner, minlength=3)) == [4, 4, 4]
+
+    def test_every_uav_has_something_to_do(self):
+        for seed in range(6):
+            owner = self.split(seed, [True] * 3, powered=0, connected=0)[1]
+            assert set(owner) == {0, 1, 2}
 
     def test_grounded_uavs_own_nothing(self):
         for seed in range(3):
-            _, owner = self.split(seed, [False, True, False, True])
-            assert set(owner) == {1, 3}
+            _, owner = self.split(seed, [False, True, True])
+            assert set(owner) == {1, 2}
 
     def test_more_uavs_than_devices(self):
-        _, owner = self.split(0, [True] * 9, devices=4, powered=0, connected=0)
+        _, owner = self.split(0, [True] * 9, devices=4, powered=4, connected=0, uav_signal_range_m=1.0)
         assert len(set(owner)) == 4
 
     def test_devices_that_share_a_hover_point_stay_together(self):
-        params, layout = town(0, uavs=3, devices=9, powered=0, connected=0)
-        # Three clusters of three, each within range of its middle device.
-        middles = np.repeat([[100.0, 100.0], [700.0, 100.0], [400.0, 700.0]], 3, axis=0)
-        layout = layout.replace(position=jnp.asarray(middles + np.tile([[-50, 0], [0, 0], [50, 0]], (3, 1)), jnp.float32))
+        params, layout = town(0, uavs=3, devices=12, powered=0, connected=0)
+        # Four clusters of three, each within range of its middle device.
+        middles = np.repeat([[100.0, 100.0], [700.0, 100.0], [100.0, 700.0], [700.0, 700.0]], 3, axis=0)
+        layout = layout.replace(
+            position=jnp.asarray(middles + np.tile([[-50, 0], [0, 0], [50, 0]], (4, 1)), jnp.float32)
+        )
         owner = np.asarray(jax.jit(split_among)(params, layout, jnp.ones(3, bool)))
-        assert (owner.reshape(3, 3) == owner.reshape(3, 3)[:, :1]).all()
+        assert (owner.reshape(4, 3) == owner.reshape(4, 3)[:, :1]).all()
         assert set(owner) == {0, 1, 2}
 
     def test_neighbours_belong_together(self):
         """Groups are sectors: the mean distance to one's own group is far below that to the others."""
-        layout, owner = self.split(4, [True, True], powered=0, connected=0)
+        layout, owner = self.split(4, [True] * 3, powered=0, connected=0)
         position = np.asarray(layout.position)
         distance = np.linalg.norm(position[:, None] - position, axis=-1)
         same = owner[:, None] == owner

@@ -115,7 +115,9 @@ def split_among(params: Params, layout: Layout, flies: Bool[Array, " K"]) -> Int
     needy = ~layout.has_power | ~layout.has_comms
     visits = jnp.clip(needs.services / needs.slots, 0.0, 1.0)
     visits = jnp.maximum(visits, jnp.where(layout.has_comms, 0.0, 1.0 / jnp.maximum(slots_to_expiry(params), 1)))
-    weight = jnp.where(needy, visits + 1e-3, 0.0)
+    together = demand.best_hover_point(needs.covers & needy, needy)
+    weight = demand.max_by_hover_point(together, jnp.where(needy, visits + 1e-3, 0.0))
+    weight = jnp.maximum(weight, 0.0)  # of each hover point
     middle = jnp.sum(layout.position * weight[:, None], axis=0) / jnp.maximum(jnp.sum(weight), 1e-6)
     east, north = (layout.position - middle).T
     angle = jnp.arctan2(north, east)
@@ -131,9 +133,7 @@ def split_among(params: Params, layout: Layout, flies: Bool[Array, " K"]) -> Int
         return jnp.sum(weight * jnp.sum((layout.position - centre[group]) ** 2, axis=1)), group
 
     spread, group = jax.lax.map(sweep, jnp.arange(layout.n_devices))
-    best = group[jnp.argmin(jnp.where(needy, spread, jnp.inf))]
-    covers = needs.covers & needy
-    together = demand.best_hover_point(covers, needy)
+    best = group[jnp.argmin(jnp.where(weight > 0, spread, jnp.inf))]
     uav_of_group = jnp.argsort(~flies, stable=True)
     return uav_of_group[best[together]]
 

@@ -145,14 +145,16 @@ def _longest_slot(
     sends = jnp.any(layout.has_comms & present)
     t_results = jnp.where(sends, 8.0 * params.result_message_bytes / params.uplink_rate_bit_s, 0.0)
     distance = jnp.linalg.norm(layout.places() - state.uav_position[:, None], axis=-1)
+    t_fly = distance / fleet.speed_m_s[:, None]
     goals = flies[:, None] & jnp.concatenate([present, helps])
-    t_fly = jnp.max(jnp.where(goals, distance / fleet.speed_m_s[:, None], 0.0))
+    goals &= fleet.flying_power_w[:, None] * t_fly <= state.uav_energy[:, None]
+    longest_flight = jnp.max(jnp.where(goals, t_fly, 0.0))
     highest, lowest = (jnp.where(present[:, None], layout.position, fill) for fill in (-jnp.inf, jnp.inf))
     extent = jnp.linalg.norm(jnp.max(highest, axis=0) - jnp.min(lowest, axis=0))
     slant = jnp.minimum(jnp.max(jnp.where(flies, fleet.signal_range_m, 0.0)), jnp.hypot(extent, params.uav_altitude_m))
     slant = jnp.maximum(slant, params.uav_altitude_m)
     t_upload = 8.0 * params.task_volume_range_bytes[1] / upload_rate(params, slant[None])[0]
-    return jnp.maximum(params.slot_cap_s + t_results, t_fly + t_upload)
+    return jnp.maximum(params.slot_cap_s + t_results, longest_flight + t_upload)
 
 
 def _lasts(
