@@ -71,16 +71,19 @@ def plan_returns(params: Params, layout: Layout, state: State, slots_to_go: Arra
     longest = _longest_slot(params, layout, fleet, state, helps)
 
     full = energy >= fleet.battery_j
-    slots_left = jnp.maximum(_lasts(layout, fleet, energy, way_back, longest), 0.0)
+    farthest = jnp.max(jnp.where(_present(layout) & jnp.isfinite(way_back), way_back, 0.0))
+    flight, hovering = fleet.flying_power_w * farthest / fleet.speed_m_s, fleet.hovering_power_w * longest
+    slots_left = jnp.maximum((energy - 2.0 * flight) / hovering, 0.0)
     wants = jnp.isfinite(jnp.min(distance, axis=1)) & ~full & (slots_left < slots_to_go)
     slots_left = jnp.where(wants, slots_left, jnp.inf)
-    full_lasts = jnp.where(flies, _lasts(layout, fleet, fleet.battery_j, way_back, longest), jnp.inf)
-    most = jnp.maximum(jnp.min(full_lasts) / jnp.maximum(jnp.sum(flies), 1), 1.0)
-    refill = jnp.clip(jnp.max(jnp.where(wants, _refill_slots(params, fleet, depots, distance), 1.0)), 1.0, most)
+    full_lasts = jnp.min(jnp.where(flies, (fleet.battery_j - 2.0 * flight) / hovering, jnp.inf))
+    refill = jnp.minimum(_refill_slots(params, fleet, depots, distance, wants), full_lasts / jnp.sum(flies))
+    refill = jnp.maximum(refill, 1.0)
     together = jnp.clip(jnp.sum(jnp.where(helps, depots.pads, 0.0)), 1, jnp.maximum(1, jnp.sum(flies) // 4))
-    # So many UAVs a turn, in the order of their energy: the first ones go if a later one would otherwise be too late.
     turn = jnp.floor(_rank(slots_left) / together) * refill
-    urgent, tight = slots_left < 1.0, jnp.any(slots_left < turn + 1.0)
+    # So many UAVs a turn, in the order of their energy: the first ones go if a later one would otherwise have to wait.
+    latest = 1.0 + turn * (1.0 + flight / hovering)
+    urgent, tight = slots_left < 1.0, jnp.any(slots_left < latest)
 
     packs = jnp.where(depots.kind == DepotKind.SWAP, jnp.floor(state.packs), jnp.inf)
     low = wants & (energy < _LEAVE_AT * fleet.battery_j)
@@ -88,7 +91,7 @@ def plan_returns(params: Params, layout: Layout, state: State, slots_to_go: Arra
     gets &= jnp.cumsum(gets, axis=0) <= jnp.minimum(depots.pads, packs)
     return Returns(
         distance=distance,
-        away=jnp.where(slots_left < turn + 1.0 + slots_to_expiry(params), refill, 0.0),
+        away=jnp.where(slots_left < latest + slots_to_expiry(params), refill, 0.0),
         full=full,
         stays=jnp.any(gets, axis=1),
         urgent=urgent,
@@ -157,20 +160,14 @@ def _longest_slot(
     return jnp.maximum(params.slot_cap_s + t_results, longest_flight + t_upload)
 
 
-def _lasts(
-    layout: Layout, fleet: Fleet, energy: Float[Array, " K"], way_back: Float[Array, " n"], longest: Float[Array, ""]
-) -> Float[Array, " K"]:
-    """Return the slots of ``longest`` s that an energy pays for, less that for the way to and from the farthest device."""
-    farthest = jnp.max(jnp.where(_present(layout) & jnp.isfinite(way_back), way_back, 0.0))
-    kept = 2.0 * fleet.flying_power_w * farthest / fleet.speed_m_s
-    return (energy - kept) / (fleet.hovering_power_w * longest)
-
-
-def _refill_slots(params: Params, fleet: Fleet, depots: Depots, distance: Float[Array, "K D"]) -> Float[Array, " K"]:
-    """Return the slots that each UAV spends at its nearest depot: one to swap its battery, more to charge it."""
+def _refill_slots(
+    params: Params, fleet: Fleet, depots: Depots, distance: Float[Array, "K D"], wants: Bool[Array, " K"]
+) -> Float[Array, ""]:
+    """Return the most slots that a UAV spends at its nearest depot: one to swap its battery, more to charge it."""
     charging = jnp.ceil(_LEAVE_AT * fleet.battery_j[:, None] / (depots.power_w * params.slot_cap_s))
     slots = jnp.where(depots.kind == DepotKind.SWAP, 1.0, charging)
-    return jnp.take_along_axis(slots, jnp.argmin(distance, axis=1)[:, None], axis=1)[:, 0]
+    nearest = jnp.arange(depots.kind.shape[0]) == jnp.argmin(distance, axis=1)[:, None]
+    return jnp.max(jnp.where(nearest & wants[:, None], slots, 1.0))
 
 
 def _safe(
