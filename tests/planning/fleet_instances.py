@@ -54,7 +54,9 @@ def fleet_instance(seed: int, *, devices: int | None = None, max_slots: int = MA
         "hovering_power_w": [80.0, 120.0],
     }
     chosen = rng.random(4) < [1 / 3, 0.2, 0.2, 0.2]
-    fleet = make_fleet(params, 2, depots, **{name: unequal[name] for name, own in zip(unequal, chosen, strict=True) if own})
+    fleet = make_fleet(
+        params, 2, depots, **{name: unequal[name] for name, own in zip(unequal, chosen, strict=True) if own}
+    )
     layout = sample_layout(jax.random.key(seed), params, int(rng.integers(0, n - 1)), int(rng.integers(0, n)))
     layout = layout.replace(fleet=fleet, depots=depots)
     key = jax.random.key(1000 + seed)

@@ -138,10 +138,13 @@ def advise(
     for uav in range(layout.n_uavs):
         choice, candidates, episodes = _try_candidates(policy, params, layout, state, futures, action, np.int32(uav))
         lifetimes, value = np.asarray(episodes.length, float), _values(params, layout, state, episodes)
+        unit = float(params.slot_cap_s) / _seconds_left(params, state) if params.end == "horizon" else 1.0
         mine = int(np.atleast_1d(choice)[uav])
         best = int(np.argmax(prefer(mine, value.mean(axis=1))))
-        candidate_list = _rank(lifetimes, value, best, values_are_shares=params.end == "horizon")
-        uavs.append(UavAdvice(candidates=candidate_list, policy_choice=mine))
+        shares = params.end == "horizon"
+        uavs.append(
+            UavAdvice(candidates=_rank(lifetimes, unit * value, best, values_are_shares=shares), policy_choice=mine)
+        )
         action = candidates[best]
     if layout.n_depots:
         slots, seconds = _returns_in(policy, params, layout, state, futures[:_RETURN_SAMPLES], action)
@@ -168,12 +171,11 @@ def _seconds_left(params: Params, state: State) -> float:
 
 
 def _values(params: Params, layout: Layout, state: State, episodes: Episode) -> Float[np.ndarray, "C S"]:
-    """Return the value of each future of each candidate; see :class:`Candidate`."""
-    value = np.asarray(values_of(params, layout, episodes), float)
+    """Return the value of each future of each candidate in slots; see :class:`Candidate`."""
+    values = np.asarray(values_of(params, layout, episodes), float)
     if params.end == "horizon":
-        return value / _seconds_left(params, state)
-    price = np.asarray(layout.failure_price(state.elapsed))
-    return value - np.asarray(episodes.first_failure) @ price
+        return values
+    return values - np.asarray(episodes.first_failure) @ np.asarray(layout.failure_price(state.elapsed))
 
 
 @partial(jax.jit, static_argnames="policy")

@@ -6,19 +6,20 @@ Batteries are therefore served by least laxity: the one that needs the most serv
 loses no service as long as any order does not (McNaughton 1959).
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num, PRNGKeyArray
 
-from uavmec_jax.env.dynamics import State, initial_state, slots_to_expiry
-from uavmec_jax.env.layout import Layout, fleet_of
+from uavmec_jax.env.dynamics import State, complete_state, initial_state, slots_to_expiry
+from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.planning import demand, fleet_demand
 from uavmec_jax.planning.deadlines import earliest_deadline as of_one_uav
 from uavmec_jax.planning.deadlines import feasible_horizon
-from uavmec_jax.planning.fleet_rules import Choice, in_turn
+from uavmec_jax.planning.fleet_rules import Choice, in_turn, see_living, with_uav
 from uavmec_jax.planning.returns import plan_returns
 
 _TIE_PER_M = 1e-6
@@ -50,15 +51,19 @@ def earliest_deadline(params: Params, layout: Layout, state: State, key: PRNGKey
     A UAV that nothing needs serves the battery with the least left over, or returns to a depot if its own runs low. With one
     UAV and no depots the rule is :func:`deadlines.earliest_deadline`.
     """
+    state = complete_state(layout, state)
+    living, seen = _see_living(params, layout, state)
     if fleet_demand.is_alone(layout):
-        return of_one_uav(params, layout, state, key)
-    fleet, needs = fleet_of(params, layout), _needs(params, layout, state)
+        return of_one_uav(with_uav(params, layout, 0), living, seen, key)
+    needs = _needs(params, living, seen)
+    returns = plan_returns(params, layout, state, _slots_to_go(params, needs))
     servers = jnp.sum(~state.grounded)
+    away = 0.0 if returns is None else jnp.sum(returns.away)
 
     def choose(uav: Int[Array, ""], served: Bool[Array, " n"], undecided: Bool[Array, " K"]) -> Choice:
-        return _choose(layout, state, needs, uav, served, servers, jnp.sum(undecided))
+        return _choose(living, seen, needs, uav, served, servers, jnp.sum(undecided) - away)
 
-    return in_turn(params, layout, fleet, state, plan_returns(params, layout, fleet, state), choose)
+    return in_turn(params, layout, state, returns, choose)
 
 
 def split_deadline(params: Params, layout: Layout, state: State, key: PRNGKeyArray | None = None) -> Array:
@@ -67,9 +72,13 @@ def split_deadline(params: Params, layout: Layout, state: State, key: PRNGKeyArr
     The devices are split among the UAVs that still fly (:func:`split_among`).
     """
     if fleet_demand.is_alone(layout):
-        return of_one_uav(params, layout, state, key)
-    fleet, needs = fleet_of(params, layout), _needs(params, layout, state)
-    owner = split_among(params, layout, ~state.grounded)
+        return earliest_deadline(params, layout, state, key)
+    state = complete_state(layout, state)
+    living, seen = _see_living(params, layout, state)
+    needs = _needs(params, living, seen)
+    returns = plan_returns(params, layout, state, _slots_to_go(params, needs))
+    flies = ~state.grounded if returns is None else ~state.grounded & ~(returns.stays | returns.must)
+    owner = split_among(params, living, flies)
 
     def choose(uav: Int[Array, ""], served: Bool[Array, " n"], undecided: Bool[Array, " K"]) -> Choice:
         mine = owner == uav
@@ -77,9 +86,23 @@ def split_deadline(params: Params, layout: Layout, state: State, key: PRNGKeyArr
             expires_in=jnp.where(mine, needs.expires_in, demand.NEVER),
             services=jnp.where(mine, needs.services, -jnp.inf),
         )
-        return _choose(layout, state, own, uav, served, jnp.int32(1), jnp.int32(0))
+        away = jnp.float32(0.0) if returns is None else returns.away[uav]
+        return _choose(living, seen, own, uav, served, jnp.int32(1), -away)
 
-    return in_turn(params, layout, fleet, state, plan_returns(params, layout, fleet, state), choose)
+    return in_turn(params, layout, state, returns, choose)
+
+
+def _see_living(params: Params, layout: Layout, state: State) -> tuple[Layout, State]:
+    """Return what :func:`see_living` does, with data that have expired at the limit: how long ago makes no difference."""
+    living, seen = see_living(params, layout, state)
+    if params.end == "first_failure":
+        return living, seen
+    return living, replace(seen, age=jnp.minimum(seen.age, slots_to_expiry(params)))
+
+
+def _slots_to_go(params: Params, needs: _Needs) -> Float[ArrayLike, ""]:
+    """Return for how many slots the UAVs are needed: for the feasible horizon, unless episodes go on after a failure."""
+    return needs.slots if params.end == "first_failure" else jnp.inf
 
 
 def split_among(params: Params, layout: Layout, flies: Bool[Array, " K"]) -> Int[Array, " n"]:
@@ -92,25 +115,25 @@ def split_among(params: Params, layout: Layout, flies: Bool[Array, " K"]) -> Int
     needy = ~layout.has_power | ~layout.has_comms
     visits = jnp.clip(needs.services / needs.slots, 0.0, 1.0)
     visits = jnp.maximum(visits, jnp.where(layout.has_comms, 0.0, 1.0 / jnp.maximum(slots_to_expiry(params), 1)))
-    weight = jnp.where(needy, visits + 1e-3, 0.0)
+    together = demand.best_hover_point(needs.covers & needy, needy)
+    weight = demand.max_by_hover_point(together, jnp.where(needy, visits + 1e-3, 0.0))
+    weight = jnp.maximum(weight, 0.0)  # of each hover point
     middle = jnp.sum(layout.position * weight[:, None], axis=0) / jnp.maximum(jnp.sum(weight), 1e-6)
     east, north = (layout.position - middle).T
     angle = jnp.arctan2(north, east)
-    groups = jnp.maximum(jnp.sum(flies), 1)
+    before = jnp.sum(jnp.where(angle[None, :] < angle[:, None], weight, 0.0), axis=1)
+    total, groups = jnp.maximum(jnp.sum(weight), 1e-6), jnp.maximum(jnp.sum(flies), 1)
 
-    def sweep(first: Float[Array, ""]) -> tuple[Float[Array, ""], Int[Array, " n"]]:
-        turn = jnp.mod(angle - first, 2 * jnp.pi)
-        before = jnp.sum(jnp.where(turn[None, :] < turn[:, None], weight, 0.0), axis=1)
-        share = (before + 0.5 * weight) / jnp.maximum(jnp.sum(weight), 1e-6)
+    def sweep(first: Int[Array, ""]) -> tuple[Float[Array, ""], Int[Array, " n"]]:
+        turned = before - before[first] + jnp.where(angle < angle[first], total, 0.0)
+        share = (turned + 0.5 * weight) / total
         group = jnp.clip(jnp.floor(share * groups), 0, groups - 1).astype(jnp.int32)
         member = jnp.where(group == jnp.arange(flies.shape[0])[:, None], weight, 0.0)
         centre = member @ layout.position / jnp.maximum(jnp.sum(member, axis=1, keepdims=True), 1e-6)
         return jnp.sum(weight * jnp.sum((layout.position - centre[group]) ** 2, axis=1)), group
 
-    spread, group = jax.lax.map(sweep, angle)
-    best = group[jnp.argmin(spread)]
-    covers = needs.covers & needy
-    together = demand.best_hover_point(covers, needy)
+    spread, group = jax.lax.map(sweep, jnp.arange(layout.n_devices))
+    best = group[jnp.argmin(jnp.where(weight > 0, spread, jnp.inf))]
     uav_of_group = jnp.argsort(~flies, stable=True)
     return uav_of_group[best[together]]
 
@@ -140,7 +163,7 @@ def _choose(
     uav: Int[Array, ""],
     served: Bool[Array, " n"],
     servers: Int[Array, ""],
-    others: Int[Array, ""],
+    others: Num[Array, ""],
 ) -> Choice:
     """Choose the target of one UAV of ``servers``; ``others`` of them will still decide in this slot."""
     index = jnp.arange(layout.n_devices)
@@ -155,6 +178,5 @@ def _choose(
     battery = jnp.argmax(services - _TIE_PER_M * distance)
     needing = jnp.sum(needs.covers & (services > 0), axis=1) + 0.5 * (index == battery)
     above = jnp.argmax(jnp.where(needs.covers[:, battery], needing, -1.0))
-    stay = jnp.where(jnp.min(distance) <= 0.0, jnp.argmin(distance), due)
-    spare = jnp.where(services[battery] > -jnp.inf, above, stay)
+    spare = jnp.where(services[battery] > -jnp.inf, above, jnp.argmin(distance))
     return Choice(jnp.where(can_wait, spare, due), ~can_wait | (services[battery] > 0))

@@ -9,12 +9,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PRNGKeyArray
 
-from uavmec_jax.env.dynamics import State
-from uavmec_jax.env.fleet import UAV_FIELDS, Fleet
-from uavmec_jax.env.layout import Layout, fleet_of
+from uavmec_jax.env.dynamics import State, complete_state, living_devices
+from uavmec_jax.env.fleet import UAV_FIELDS
+from uavmec_jax.env.layout import Layout, fleet_of, mask_absent
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Policy
-from uavmec_jax.planning.returns import Returns, plan_returns
+from uavmec_jax.planning.fleet_demand import is_alone
+from uavmec_jax.planning.returns import Returns, plan_returns, send
+
+_ABSENT_AGE = -2
+"""Age at which a rule sees devices that are out for good: below that of the devices already cared for."""
 
 
 class Choice(NamedTuple):
@@ -33,46 +37,34 @@ Chooser = Callable[[Int[Array, ""], Bool[Array, " n"], Bool[Array, " K"]], Choic
 """``(UAV, devices served so far, UAVs that have not decided yet) -> Choice``."""
 
 
-def in_turn(
-    params: Params, layout: Layout, fleet: Fleet, state: State, returns: Returns | None, choose: Chooser
-) -> Int[Array, "*K"]:
-    """Let the UAVs decide in turn and return the action: those that must return to a depot do, the others choose.
-
-    A UAV that has to return is not asked; one whose energy does not cover the chosen visit, a slot there and the way to a
-    depot returns too.
-    """
-    covers = coverage_by_uav(params, layout, fleet)
+def in_turn(params: Params, layout: Layout, state: State, returns: Returns | None, choose: Chooser) -> Int[Array, "*K"]:
+    """Let the UAVs decide in turn and return the action: those that have to return to a depot do, the others choose."""
+    covers = coverage_by_uav(params, layout)
     n, uavs = layout.n_devices, layout.n_uavs
-    leaves = jnp.zeros(uavs, bool) if returns is None else returns.must
-    undecided = ~state.grounded & ~leaves
+    undecided = ~state.grounded
+    if returns is not None:
+        undecided &= ~(returns.must | returns.stays)
 
-    def decide(carry: tuple[Array, Array], uav: Int[Array, ""]) -> tuple[tuple[Array, Array], Int[Array, ""]]:
-        served, undecided = carry
+    def decide(carry: tuple, uav: Int[Array, ""]) -> tuple[tuple, Int[Array, ""]]:
+        served, undecided, returns = carry
         undecided = undecided.at[uav].set(False)
         choice = choose(uav, served, undecided)
         place = choice.device.astype(jnp.int32)
         if returns is not None:
-            distance = jnp.linalg.norm(layout.position[place] - state.uav_position[uav])
-            flight = fleet.flying_power_w[uav] * distance / fleet.speed_m_s[uav]
-            after = state.uav_energy[uav] - flight - fleet.hovering_power_w[uav] * params.slot_cap_s
-            home = returns.reserve[uav, place]
-            stranded = jnp.isfinite(home) & (after < home) & (state.uav_energy[uav] < fleet.battery_j[uav])
-            goes = leaves[uav] | stranded | (~choice.needed & returns.may[uav])
-            place = jnp.where(goes, returns.depot[uav], place)
+            place, returns = send(layout, returns, uav, place, choice.needed)
         hovers = (place < n) & ~state.grounded[uav]
         served |= covers(uav, jnp.minimum(place, n - 1)) & hovers
-        return (served, undecided), place
+        return (served, undecided, returns), place
 
-    start = (jnp.zeros(n, bool), undecided)
+    start = (jnp.zeros(n, bool), undecided, returns)
     if uavs == 1:
         return decide(start, jnp.int32(0))[1]
     return jax.lax.scan(decide, start, jnp.arange(uavs))[1]
 
 
-def coverage_by_uav(
-    params: Params, layout: Layout, fleet: Fleet
-) -> Callable[[Int[Array, ""], Int[Array, ""]], Bool[Array, " n"]]:
+def coverage_by_uav(params: Params, layout: Layout) -> Callable[[Int[Array, ""], Int[Array, ""]], Bool[Array, " n"]]:
     """Return the function ``(UAV, device) -> devices that it serves from above that device``."""
+    fleet = fleet_of(params, layout)
 
     def covers(uav: Int[Array, ""], device: Int[Array, ""]) -> Bool[Array, " n"]:
         ground = layout.position - layout.position[device]
@@ -87,38 +79,61 @@ def for_fleets(rule: Policy) -> Policy:
 
     UAVs decide in turn by the rule, in a network in which the devices already cared for are fresh and fully charged; their
     slots are numbered on, so that rules that count slots do not send all to the same device. With one UAV and no depots the
-    policy is the rule itself.
+    policy is the rule itself. Where episodes go on after a failure, the rule does not see the devices that are out for good.
     """
 
     @wraps(rule)
     def policy(params: Params, layout: Layout, state: State, key: PRNGKeyArray | None = None) -> Array:
-        if layout.n_uavs == 1 and not layout.n_depots:
-            return rule(params, layout, state, key)
-        fleet = fleet_of(params, layout)
+        state = complete_state(layout, state)
+        living, seen = see_living(params, layout, state)
+        if is_alone(layout):
+            return rule(with_uav(params, layout, 0), living, seen, key)
 
         def choose(uav: Int[Array, ""], served: Bool[Array, " n"], undecided: Bool[Array, " K"]) -> Choice:
-            seen = see_as_one(params, layout, fleet, state, uav, served)
             own_key = None if key is None else jax.random.fold_in(key, uav)
-            return Choice(rule(*seen, own_key), jnp.asarray(True))
+            device = rule(*see_as_one(params, living, seen, uav, served), own_key)
+            if living.present is not None:
+                device = jnp.where(living.present[device], device, jnp.argmax(living.present))
+            return Choice(device, jnp.asarray(True))
 
-        return in_turn(params, layout, fleet, state, plan_returns(params, layout, fleet, state), choose)
+        return in_turn(params, layout, state, plan_returns(params, layout, state), choose)
 
     return policy
 
 
+def see_living(params: Params, layout: Layout, state: State) -> tuple[Layout, State]:
+    """Return layout and state with the devices that are out for good as padding.
+
+    If the first failure ends the episode there are none, and both stay what they are.
+    """
+    present = living_devices(params, layout, state)
+    if present is None:
+        return layout, state
+    age = jnp.where(present, state.age, _ABSENT_AGE)
+    return mask_absent(layout, present), replace(state, battery=jnp.where(present, state.battery, 1.0), age=age)
+
+
 def see_as_one(
-    params: Params, layout: Layout, fleet: Fleet, state: State, uav: Int[Array, ""], served: Bool[Array, " n"]
+    params: Params, layout: Layout, state: State, uav: Int[Array, ""], served: Bool[Array, " n"]
 ) -> tuple[Params, Layout, State]:
     """Return parameters, layout and state as the only UAV would see them, with the devices ``served`` already cared for."""
-    own = {f"uav_{name}": getattr(fleet, name)[uav] for name in UAV_FIELDS}
+    age = state.age if layout.present is None else jnp.where(layout.present, state.age, _ABSENT_AGE)
+    flies = ~state.grounded
     alone = replace(
         state,
         battery=jnp.where(served, layout.capacity, state.battery),
-        age=jnp.where(served, -1, state.age),
+        age=jnp.where(served, -1, age),
         uav_position=state.uav_position[uav][None],
         uav_energy=state.uav_energy[uav][None],
         grounded=state.grounded[uav][None],
-        slot=state.slot * layout.n_uavs + uav,
+        slot=state.slot * jnp.sum(flies) + jnp.sum(flies & (jnp.arange(layout.n_uavs) < uav)),
         packs=jnp.zeros(0, jnp.float32),
     )
-    return replace(params, **own), replace(layout, fleet=None, depots=None), alone
+    return with_uav(params, layout, uav), replace(layout, fleet=None, depots=None), alone
+
+
+def with_uav(params: Params, layout: Layout, uav: int | Int[Array, ""]) -> Params:
+    """Return the parameters with the speed, powers, battery and range of one UAV of the layout."""
+    if layout.fleet is None:
+        return params
+    return replace(params, **{f"uav_{name}": getattr(layout.fleet, name)[uav] for name in UAV_FIELDS})

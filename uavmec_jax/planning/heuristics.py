@@ -22,7 +22,7 @@ from uavmec_jax.planning.shortest_tour import shortest_tour
 
 def stay_put(params: Params, layout: Layout, state: State, key: PRNGKeyArray | None = None) -> Array:
     """Hover above the first device for the whole episode; the UAVs of a fleet hover above the first ones."""
-    return jnp.argmax(state.age >= 0).astype(jnp.int32)
+    return jnp.argmax(jnp.minimum(state.age, 0)).astype(jnp.int32)
 
 
 def random(params: Params, layout: Layout, state: State, key: PRNGKeyArray | None = None) -> Array:

@@ -9,7 +9,7 @@ from typing import TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int, Key, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key, PRNGKeyArray
 
 from uavmec_jax.env.dynamics import State
 from uavmec_jax.env.layout import Layout
@@ -55,7 +55,8 @@ def rollout_planner(base: Policy = earliest_deadline, samples: int = SAMPLES) ->
             candidates = candidates_of(layout, action, uav)
             episodes = try_candidates(base, params, layout, state, futures, candidates)
             mine = action if layout.n_uavs == 1 else action[uav]
-            best = jnp.argmax(prefer(mine, jnp.mean(values_of(params, layout, episodes), axis=1)))
+            value = prefer(mine, jnp.mean(values_of(params, layout, episodes), axis=1))
+            best = jnp.argmax(jnp.where(real_places(layout), value, -jnp.inf))
             return candidates[best].astype(jnp.int32)
 
         if layout.n_uavs == 1:
@@ -73,13 +74,21 @@ def candidates_of(layout: Layout, action: Int[Array, "*K"], uav: int | Int[Array
     return jnp.where(jnp.arange(layout.n_uavs) == uav, places[:, None], action)
 
 
+def real_places(layout: Layout) -> Bool[Array, " n_places"]:
+    """Return which places are devices or depots and not padding."""
+    devices = jnp.ones(layout.n_devices, bool) if layout.present is None else layout.present
+    return devices if layout.depots is None else jnp.concatenate([devices, layout.depots.pads >= 1])
+
+
 def values_of(params: Params, layout: Layout, episodes: Episode) -> Float[Array, "*batch"]:
-    """Return what the planner makes as large as it can: the lifetimes, or with a horizon, the seconds in service.
+    """Return what the planner makes as large as it can: the lifetimes, or with a horizon, the time in service.
+
+    Both are in slots, the time in service in slots of the longest kind.
 
     For fleets the last slot counts up to the first failure in it: candidates that seem equal in whole slots are told apart.
     """
     if params.end == "horizon":
-        return jnp.asarray(episodes.service_s)
+        return jnp.asarray(episodes.service_s) / params.slot_cap_s
     lifetimes = episodes.length.astype(jnp.float32)
     return lifetimes if is_alone(layout) else lifetimes + (episodes.lasted - 1.0)
 
