@@ -1,5 +1,6 @@
 """All tests run with shapes and types checked at run time, and with two CPU devices."""
 
+import gc
 import os
 import sys
 import tempfile
@@ -28,6 +29,8 @@ if os.environ.pop("PYTHONDONTWRITEBYTECODE", ""):
     sys.dont_write_bytecode = False
 
 import jax
+import psutil
+import pytest
 from jaxtyping import install_import_hook
 
 import tests.typechecking  # noqa: F401  (the hook below finds it by name)
@@ -35,3 +38,16 @@ import tests.typechecking  # noqa: F401  (the hook below finds it by name)
 jax.config.update("jax_num_cpu_devices", 2)
 
 install_import_hook("uavmec_jax", "tests.typechecking.checked")
+
+_MAX_RESIDENT_BYTES = 1.5e9
+"""Memory with which a process lets go of its compiled programs between two files of tests: machines with many workers have
+little for each, and a process may only map so many pieces of memory."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _bounded_memory():
+    """Drop the compiled programs of earlier files of tests once they take much memory."""
+    yield
+    if psutil.Process().memory_info().rss > _MAX_RESIDENT_BYTES:
+        jax.clear_caches()
+        gc.collect()
