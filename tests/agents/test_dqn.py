@@ -166,6 +166,7 @@ def test_same_seed_is_bit_equal_and_seeds_differ():
     assert (kernel[0] != kernel[2]).any()
 
 
+@pytest.mark.slow
 def test_chunks_do_not_matter():
     agents = stack([make_agent(0), make_agent(1)])
     whole, pieces = train(SPEC, agents, 0, 400), train(SPEC, agents, 0, 7, 150, 400)

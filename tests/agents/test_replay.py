@@ -50,11 +50,11 @@ def filled(spec, n, seed=0):
 @pytest.mark.parametrize(
     ("n_devices", "capacity", "stride", "max_age", "written", "wraps"),
     [
-        (12, 40, 4, 11, 40, False),
         (12, 40, 4, 11, 24, False),
-        (12, 16, 4, 11, 100, True),
         (3, 10, 1, 250, 37, True),
-        (64, 9, 5, 30, 60, True),
+        pytest.param(12, 40, 4, 11, 40, False, marks=pytest.mark.slow),
+        pytest.param(12, 16, 4, 11, 100, True, marks=pytest.mark.slow),
+        pytest.param(64, 9, 5, 30, 60, True, marks=pytest.mark.slow),
     ],
 )
 def test_every_transition_is_stored_exactly(jit, n_devices, capacity, stride, max_age, written, wraps):

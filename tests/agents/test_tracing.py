@@ -20,7 +20,7 @@ ALGORITHMS = {
 }
 
 
-@pytest.mark.parametrize("name", ["dqn", "a2c", pytest.param("ppo", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["a2c", *(pytest.param(name, marks=pytest.mark.slow) for name in ("dqn", "ppo"))])
 def test_update_is_traced_once(name):
     algorithm, hyper_class = ALGORITHMS[name]
     chex.clear_trace_counter()

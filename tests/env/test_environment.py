@@ -113,6 +113,7 @@ def test_rollout_gives_two_policies_the_same_volumes():
         assert_array_equal(batteries["a", slot], batteries["b", slot])
 
 
+@pytest.mark.slow
 def test_rollouts_differ_by_draw_and_repeat_by_key():
     keys = jax.random.split(jax.random.key(0), 16)
     first = rollouts(oldest_first, PARAMS, layout_of(5, 4, 4), keys)

@@ -42,12 +42,8 @@ class Shape(NamedTuple):
 
 SHAPES = [
     Shape(1, 0, 5, "first_failure", fleet=False),
-    Shape(1, 2, 5, "first_failure"),
-    Shape(2, 1, 6, "horizon"),
     Shape(3, 2, 6, "first_failure"),
-    Shape(3, 0, 6, "horizon"),
     Shape(4, 3, 7, "horizon"),
-    Shape(6, 2, 8, "first_failure"),
 ]
 ALL_SHAPES = [
     Shape(k, d, 4 + k, end) for k in (1, 2, 3, 4, 6) for d in range(4) for end in ("first_failure", "horizon")

@@ -25,7 +25,7 @@ def layout_with_a_pair():
     return layout.replace(position=position.at[1].set(position[0] + 40.0), capacity=jnp.full(12, 79_000.0))
 
 
-@pytest.mark.parametrize(("powered", "connected", "seed"), [(8, 8, 3), (4, 4, 14)])
+@pytest.mark.parametrize(("powered", "connected", "seed"), [pytest.param(8, 8, 3, marks=pytest.mark.slow), (4, 4, 14)])
 def test_the_tour_reaches_its_lifetime(powered, connected, seed):
     layout, key = layout_for_seed(seed, PARAMS, powered, connected), jax.random.key(seed)
     tour = search(PARAMS, layout, volume_table(PARAMS, 12, key, SLOTS), 64)

@@ -121,7 +121,7 @@ def test_no_optimum_exceeds_the_bound(first_seed):
     assert np.mean(np.array(gaps) == 0) >= 0.6
 
 
-@pytest.mark.parametrize("seed", [15, 82])
+@pytest.mark.parametrize("seed", [pytest.param(15, marks=pytest.mark.slow), 82])
 def test_the_optimum_of_two_small_instances_is_the_bound(seed):
     """A swap depot with one pad; no depot, and a UAV with a tenth of the other's battery."""
     *instance, tour = solved_instance(seed)
@@ -130,6 +130,7 @@ def test_the_optimum_of_two_small_instances_is_the_bound(seed):
     assert upper_bound(params, layout, volumes) == tour.lifetime < params.max_slots
 
 
+@pytest.mark.slow
 def test_a_uav_that_is_grounded_early_refutes_nothing():
     """Intact networks live as long as the better battery lasts, and one slot of two UAVs costs more than the other has."""
     layout, volumes = town(0, 12, 12, uavs=2, battery_j=[1.6e6, 0.16e6])
@@ -140,7 +141,7 @@ def test_a_uav_that_is_grounded_early_refutes_nothing():
     assert 33 <= lifetime <= alone <= upper_bound(params, layout, volumes) <= alone + 1
 
 
-@pytest.mark.parametrize("kind", ["swap", "charge"])
+@pytest.mark.parametrize("kind", ["swap", pytest.param("charge", marks=pytest.mark.slow)])
 def test_depots_never_shorten_a_bound(kind):
     params, at_origin = traced(PARAMS), [[0.0, 0.0]]
     for uavs in (1, 2):

@@ -69,7 +69,7 @@ def reaches(layout, history):
     return np.any(helps & (history.uav_energy[..., None] >= 1.0001 * power * distance), axis=-1) & ~history.grounded
 
 
-@pytest.mark.parametrize("name", ["earliest-deadline", "oldest-first"])
+@pytest.mark.parametrize("name", [pytest.param("earliest-deadline", marks=pytest.mark.slow), "oldest-first"])
 def test_who_can_reach_a_depot_is_never_grounded(name):
     """From anywhere in an episode, with UAVs that differ, few pads and packs, slow UAVs and slow links."""
     towns, states = [], []

@@ -43,6 +43,7 @@ def rows(shown, title):
     return [[cell.strip() for cell in line.strip("│").split("│")] for line in lines[:end] if line.startswith("│")]
 
 
+@pytest.mark.slow
 def test_data_of_every_uav():
     data = plan_data(hamlet_plan(), hamlet())
     slots = data["slots"]["rollout"]

@@ -224,6 +224,7 @@ def test_damaged_and_foreign_files_are_refused(run, tmp_path):
         load_policy(tmp_path / "none.npz")
 
 
+@pytest.mark.slow
 def test_a_trained_policy_lifted_to_a_fleet(run):
     """One UAV with a depot and three UAVs decide by the policy; without any depot, the first one does as if it were alone."""
     policy = load_policy(run, seed=1, powered=12, connected=4)

@@ -474,6 +474,7 @@ def test_comparisons_leave_out_cells_that_are_mostly_censored(results):
 GRID = TOML.replace("uav_battery_j = [8e5, 1.6e6]\n", "")
 
 
+@pytest.mark.slow
 def test_a_run_of_heuristics(tmp_path):
     """Two cells of each fleet, cut into several shards, and stopped after the first."""
     study = parse_study(GRID, "fleets", {"evaluation.planners": [], "evaluation.baselines": ["oldest-first"]})
