@@ -132,7 +132,7 @@ def _reset_ended(
     """Start new episodes where one has ended, in newly drawn scenarios if the agent has a distribution."""
     scenario = agent.scenario
     if isinstance(scenario, Scenario):
-        env_states = jax.vmap(auto_reset, (0, None, 0))(ended, scenario, after)
+        env_states = jax.vmap(auto_reset, (0, None, 0, 0))(ended, scenario, state.env_states, after)
         return replace(state, env_states=env_states)
     new_scenarios = jax.vmap(partial(sample_scenario, scenario))(jax.random.split(key, ended.shape[0]))
     new_states = jax.vmap(initial_state)(new_scenarios.params, new_scenarios.layout)

@@ -290,7 +290,7 @@ def _act(
     row = replay.pack(spec.replay, action, reward, after.battery / layout.capacity, after.age, terminated, ended)
     state = replace(
         state,
-        env_state=auto_reset(ended, scenario, after),
+        env_state=auto_reset(ended, scenario, state.env_state, after),
         episode_slots=state.episode_slots + jnp.where(ended, after.slot, 0),
         episodes=state.episodes + ended,
     )

@@ -77,7 +77,7 @@ class UavMecEnv:
         terminated = outcome.cause != Cause.NONE
         truncated = is_truncated(scenario, after, outcome)
         final_observation = self._observe(scenario, after)
-        next_state = auto_reset(terminated | truncated, scenario, after)
+        next_state = auto_reset(terminated | truncated, scenario, state, after)
         info = {
             "terminated": terminated,
             "truncated": truncated,

@@ -76,13 +76,12 @@ def is_truncated(scenario: Scenario, state: State, outcome: Outcome) -> Bool[Arr
     return (outcome.cause == Cause.NONE) & (state.slot >= scenario.params.max_slots)
 
 
-def auto_reset(ended: Bool[Array, ""], scenario: Scenario, state: State) -> State:
-    """Return the initial state if the episode has ended, else ``state``."""
+def auto_reset(ended: Bool[Array, ""], scenario: Scenario, before: State, after: State) -> State:
+    """Return the initial state if the slot from ``before`` to ``after`` has ended the episode, else ``after``."""
     fresh = initial_state(scenario.params, scenario.layout)
-    if (
-        scenario.params.end == "first_failure"
-    ):  # where an episode goes on, nothing has failed: the loop carries constants
-        state = replace(state, failed_at=fresh.failed_at)
+    state = jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, after)
+    if scenario.params.end == "first_failure":  # what no slot changes that an episode goes on from costs a loop nothing
+        state = replace(state, failed_at=before.failed_at)
         if not scenario.layout.action_shape and not scenario.layout.n_depots:
-            state = replace(state, grounded=fresh.grounded, packs=fresh.packs)
-    return jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, state)
+            state = replace(state, grounded=before.grounded, packs=before.packs)
+    return state

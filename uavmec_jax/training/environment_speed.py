@@ -29,7 +29,7 @@ def random_steps(
         uniform = jax.random.uniform(jax.random.fold_in(key, i), (n + scenario.layout.n_uavs,))
         action = jnp.minimum((uniform[n:] * places).astype(jnp.int32), places - 1)
         after, reward, outcome = advance(scenario, state, action, draw_volumes(scenario.params, uniform[:n]))
-        return auto_reset(outcome.cause != Cause.NONE, scenario, after), total + reward
+        return auto_reset(outcome.cause != Cause.NONE, scenario, state, after), total + reward
 
     return jax.lax.fori_loop(0, steps, step, (state, jnp.float32(0)))
 
