@@ -17,7 +17,7 @@ import numpy as np
 from reports import write_report
 
 from uavmec_jax.env.params import Params
-from uavmec_jax.planning.fleet_demand import horizon
+from uavmec_jax.planning.fleet_demand import planned_slots
 from uavmec_jax.planning.parallel import beam_episodes, bound_scenarios, rollout_planner_episodes
 from uavmec_jax.planning.rollout_planner import SAMPLES
 from uavmec_jax.scenarios.seeds import held_out_draws, layout_for_seed
@@ -52,7 +52,7 @@ def benchmark(powered: int, connected: int, count: int, widths: list[int]) -> li
     layouts = jax.vmap(lambda seed: layout_for_seed(seed, Params(), powered, connected))(jnp.arange(count))
     keys = jnp.concatenate([held_out_draws(seed, powered, connected, 1) for seed in range(count)])
     scenarios = (params, layouts, keys)
-    slots = horizon(params, layouts)
+    slots = planned_slots(params, layouts)
     rows, reached = [], np.ones(count)
 
     def measure(planner: str, function: Callable, *arguments: Any, **options: Any) -> np.ndarray:

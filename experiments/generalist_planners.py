@@ -18,7 +18,7 @@ import jax
 import numpy as np
 from reports import write_report
 
-from uavmec_jax.planning.fleet_demand import horizon
+from uavmec_jax.planning.fleet_demand import planned_slots
 from uavmec_jax.planning.heuristics import HEURISTICS
 from uavmec_jax.planning.parallel import beam_episodes, policy_episodes, rollout_planner_episodes
 from uavmec_jax.planning.rollout_planner import SAMPLES
@@ -43,7 +43,7 @@ def main() -> None:
     study = load_study("planning", {"axes.seeds": arguments.layouts})
     scenario, keys = make_agents(study).scenario, evaluation_keys(study)[:, 0]
     scenarios = (scenario.params, scenario.layout)
-    slots = horizon(*scenarios)
+    slots = planned_slots(*scenarios)
 
     lifetimes: dict[str, np.ndarray] = {}
     seconds: dict[str, float] = {}

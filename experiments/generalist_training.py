@@ -34,7 +34,7 @@ from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import rollouts, tour_policy, trace, volume_table
 from uavmec_jax.planning.beam import WIDTH, beam_search
-from uavmec_jax.planning.fleet_demand import horizon, longest
+from uavmec_jax.planning.fleet_demand import longest, planned_slots
 from uavmec_jax.planning.parallel import spread
 from uavmec_jax.runs.results_folder import load_results
 from uavmec_jax.runs.run_plan import plan_run
@@ -206,7 +206,10 @@ def demonstrate(study: Study, distribution: ScenarioDistribution, count: int) ->
     # A few drawn scenarios can last for hundreds of slots, for which the beam takes hours.
     short = np.flatnonzero(np.asarray(longest(scenarios.params, scenarios.layout)) <= _MAX_SLOTS)[:count]
     scenarios, keys = jax.tree.map(lambda leaf: leaf[short], (scenarios, keys))
-    slots, observation_fn = horizon(scenarios.params, scenarios.layout), spec_of(study).observation_spec.observation_fn
+    slots, observation_fn = (
+        planned_slots(scenarios.params, scenarios.layout),
+        spec_of(study).observation_spec.observation_fn,
+    )
 
     def play(params: Params, layout: Layout, key: Key[Array, ""]) -> tuple[Array, ...]:
         volumes = volume_table(params, layout.capacity.shape[0], key, slots)

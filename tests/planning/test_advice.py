@@ -34,10 +34,10 @@ def advice(scenario):
 
 def test_the_best_candidate_comes_first(advice):
     lifetimes = [candidate.lifetime for candidate in advice.candidates]
-    assert advice.device == advice.candidates[0].device
+    assert advice.place == advice.candidates[0].place
     assert lifetimes[1:] == sorted(lifetimes[1:], reverse=True)
     assert lifetimes[0] >= lifetimes[1] - 1e-3
-    assert {candidate.device for candidate in advice.candidates} == set(range(6))
+    assert {candidate.place for candidate in advice.candidates} == set(range(6))
     for candidate in advice.candidates:
         assert_allclose(candidate.behind, lifetimes[0] - candidate.lifetime, atol=1e-5)
         assert candidate.behind_low <= candidate.behind <= candidate.behind_high
@@ -96,7 +96,7 @@ def test_the_policys_own_choice_is_kept_where_nothing_is_better():
     params, layout, _ = mid_life(0, 3)
     layout = layout.replace(has_power=jnp.ones(3, bool), has_comms=jnp.ones(3, bool), position=jnp.zeros((3, 2)))
     advice = advise(POLICY, params, layout, samples=8)
-    assert advice.device == advice.policy_choice
+    assert advice.place == advice.policy_choice
     assert advice.forecast.first_failure.sum() == 0
 
 
@@ -107,7 +107,7 @@ def test_forecasts_agree_with_independent_futures(scenario):
     advice = advise(POLICY, params, layout, samples=256)
 
     def policy(params, layout, state, key=None):
-        return jnp.where(state.slot == 0, advice.device, POLICY(params, layout, state, key))
+        return jnp.where(state.slot == 0, advice.place, POLICY(params, layout, state, key))
 
     keys = jax.random.split(jax.random.key(99), 256)
     episodes = jax.jit(lambda: rollouts(policy, params, layout, keys))()

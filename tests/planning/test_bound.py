@@ -15,7 +15,7 @@ from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import rollout, volume_table
 from uavmec_jax.planning.beam import beam_search
 from uavmec_jax.planning.bound import upper_bound
-from uavmec_jax.planning.fleet_demand import horizon
+from uavmec_jax.planning.fleet_demand import planned_slots
 from uavmec_jax.planning.flight import Rounds
 from uavmec_jax.planning.heuristics import HEURISTICS
 from uavmec_jax.planning.hover_sets import ListedHoverSets
@@ -77,7 +77,7 @@ def test_no_policy_exceeds_the_bound_on_many_layouts(side):
     counts = np.random.default_rng(int(side)).integers(0, 13, (2, count))
     layouts = jax.vmap(layout_for_seed)(jnp.arange(count), params, *jnp.asarray(counts))
     keys = jax.random.split(jax.random.key(int(side)), count)
-    slots = horizon(params, layouts)
+    slots = planned_slots(params, layouts)
     episodes = heuristic_episodes(tuple(HEURISTICS), params, layouts, keys[:, None])
     lifetimes = dict(zip(HEURISTICS, episodes.length[:, :, 0], strict=True))
     lifetimes["rollout"] = rollout_planner_episodes(params, layouts, keys, slots=slots, samples=2)[1].length
@@ -107,7 +107,7 @@ def test_volumes_that_end_before_a_lifetime_may_are_refused():
 def test_no_lifetime_exceeds_the_horizon():
     params = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], Params(n_devices=3))
     layout = three_devices(has_power=(True,) * 3, has_comms=(True,) * 3, processing_rate=jnp.full(3, 4e4))
-    slots = horizon(params, jax.tree.map(lambda leaf: leaf[None], layout))
+    slots = planned_slots(params, jax.tree.map(lambda leaf: leaf[None], layout))
     lifetime = int(rollout(HEURISTICS["stay-put"], Params(n_devices=3), layout, jax.random.key(0)).length)
     assert 64 < lifetime <= slots == 512
 

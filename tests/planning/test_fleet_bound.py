@@ -15,7 +15,7 @@ from uavmec_jax.planning import bound_instance
 from uavmec_jax.planning.bound import _Bound, upper_bound
 from uavmec_jax.planning.bound_instance import Instance, instances
 from uavmec_jax.planning.energy_rows import _refills, endurance
-from uavmec_jax.planning.fleet_demand import horizon
+from uavmec_jax.planning.fleet_demand import planned_slots
 from uavmec_jax.planning.heuristics import HEURISTICS
 from uavmec_jax.planning.hover_sets import Columns, HoverSets
 from uavmec_jax.planning.refutation import Refuter
@@ -158,8 +158,8 @@ def test_energy_limits_no_lifetime_where_there_are_depots():
     layout, volumes = town(0, 12, 12, uavs=2, depots=make_depots([[0.0, 0.0]], packs=0.0))
     assert upper_bound(params, layout, volumes) == SLOTS
     stacked = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], (params, layout))
-    assert horizon(*stacked) == SLOTS
-    assert horizon(stacked[0].replace(max_slots=jnp.array([1000])), stacked[1]) == 1024
+    assert planned_slots(*stacked) == SLOTS
+    assert planned_slots(stacked[0].replace(max_slots=jnp.array([1000])), stacked[1]) == 1024
 
 
 def test_a_fleet_of_one_is_the_uav_of_the_parameters():

@@ -59,7 +59,7 @@ def test_data_of_every_uav():
     assert [uav["grounded"] for uav in bob[:3]] == [False, True, True]
     assert bob[0]["energy_j"] == 12_000  # of 60 kJ, after 600 s at 80 W
     assert slots[1]["served"] == [2]
-    assert [row["out_of_power"] for row in slots[:4]] == [[], [], [1], [1]]
+    assert [row["dead"] for row in slots[:4]] == [[], [], [1], [1]]
     assert slots[2]["lowest_battery"]["device"] == 2  # of those that work
     assert_allclose([row["elapsed_s"] for row in slots[:4]], [600, 1200, 1800, 2400])
 
@@ -80,8 +80,8 @@ def test_data_until_a_horizon():
     assert data["service"]["rollout"] <= data["service_bound"] < 1
     assert data["first_failing"] == {"device": 1, "name": "mill", "share": 1.0, "cause": "battery"}
     measures = data["measures"]
-    assert [measures["first_failure_slot"], measures["first_failure_share"]] == [3, 1]
-    assert [measures["flights"], measures["packs"]] == [4, 2]
+    assert [measures["first_failure_slot"], measures["failure_share"]] == [3, 1]
+    assert [measures["flights"], measures["packs_used"]] == [4, 2]
     assert data["what_if"][0] == {"device": 1, "name": "mill", "change": "repair power", "service": 0.75, "gain": 0.125}
     json.dumps(data, allow_nan=False)
 
@@ -93,7 +93,7 @@ def test_data_until_the_first_failure():
     assert data["censored"] == dict.fromkeys(("oldest-first", "rollout", "beam", "bound"), 0)
     assert set(data["slots"]) == {"rollout", "beam"}
     assert data["what_if"][1] == {"device": 2, "name": "quay", "change": "remove", "lifetime": 4, "gain": -1}
-    assert data["measures"]["packs"] == 1
+    assert data["measures"]["packs_used"] == 1
 
 
 def test_table_of_a_tour():

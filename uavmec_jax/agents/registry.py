@@ -12,6 +12,9 @@ from uavmec_jax.agents.algorithm import Algorithm
 SCENARIO_SETTINGS = ("total_steps", "n_devices", "max_age")
 """Static settings that follow from the study and its scenarios, and are not set in files."""
 
+NO_HORIZON = "whose replay holds no ages beyond their limit; give end = 'first_failure', or take 'ppo' or 'a2c'"
+"""Why a DQN cannot be trained where episodes go on after a failure, and what to do."""
+
 
 @dataclass(frozen=True)
 class RegisteredAlgorithm:

@@ -111,7 +111,7 @@ def _training_lines(trained: Any, named: Any, scenario: ScenarioChoice) -> list[
     axes = ", ".join(f"{name} {value}" for name, value in trained.trained_on.items())
     lines = [f"Trained by {trained.algorithm.upper()} on {axes}."]
     lines += [f"Out of distribution: {line}." for line in trained.out_of_distribution(named.params, named.layout)]
-    lines += [f"{line[0].upper()}{line[1:]}." for line in trained.lifted_to(named.layout)]
+    lines += [f"{line[0].upper()}{line[1:]}." for line in trained.fleet_warnings(named.layout)]
     here = scenario.axes
     elsewhere = (
         scenario.file is not None

@@ -21,7 +21,8 @@ class UavMecEnv:
     """UAV-assisted edge computing with the signatures of gymnax 1.0.
 
     - Observation: f32 ``[2n]``, see :func:`observe`.
-    - Action: int in ``[0, n)``, the device to visit.
+    - Action: int32, a place for each UAV: a device in ``[0, n)`` or a depot in ``[n, n + D)``; shape ``[K]``, or ``[]`` if
+      there is one UAV.
     - Reward: f32 scalar, see :mod:`uavmec_jax.env.rewards`.
     - State: a :class:`State`.
     - ``params``: a :class:`Scenario`; ``vmap`` batches it.
@@ -42,8 +43,8 @@ class UavMecEnv:
         return make_scenario()
 
     def num_actions(self, params: Scenario) -> int:
-        """Return the number of actions, one per device."""
-        return params.layout.capacity.shape[-1]
+        """Return the number of places that each UAV can fly to, devices and depots."""
+        return params.layout.n_places
 
     def observation_shape(self, params: Scenario) -> Any:
         """Return the shape of an observation, or, if it is a pytree, the tree of its leaves' shapes."""

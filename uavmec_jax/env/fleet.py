@@ -2,7 +2,7 @@
 
 import enum
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -75,6 +75,9 @@ UAV_FIELDS = ("speed_m_s", "flying_power_w", "hovering_power_w", "battery_j", "s
 """Fields of a :class:`Fleet` whose defaults are the parameters of the same name behind ``uav_``."""
 
 
+_Range = tuple[str, Callable[[float], bool]]
+
+
 def make_fleet(params: Params, uavs: int, depots: Depots | None = None, **values: ArrayLike | Sequence) -> Fleet:
     """Return a fleet of ``uavs`` UAVs like that of the parameters, except for the given values.
 
@@ -85,8 +88,8 @@ def make_fleet(params: Params, uavs: int, depots: Depots | None = None, **values
         values: fields of :class:`Fleet`, a number for all UAVs or one per UAV; e.g. ``battery_j=[1.6e6, 0.8e6]``.
 
     Raises:
-        ValueError: a number is out of range, one line that names the field.
-        TypeError: a name is not one of a field.
+        ValueError: a number is out of range, or there are too few or too many, one line that names the field.
+        TypeError: a name is not that of a field.
     """
     if not 1 <= uavs <= MAX_UAVS:
         raise ValueError(f"uavs is {uavs}; give 1 to {MAX_UAVS}")
@@ -94,17 +97,17 @@ def make_fleet(params: Params, uavs: int, depots: Depots | None = None, **values
     present = values.pop("present", None)
     defaults: dict[str, Any] = {name: getattr(params, f"uav_{name}") for name in UAV_FIELDS}
     if unknown := set(values) - set(defaults):
-        raise TypeError(f"{sorted(unknown)[0]} is not a field of a fleet; fields are {', '.join(UAV_FIELDS)}, start_m")
-    fields = {
-        name: jnp.broadcast_to(jnp.asarray(value, jnp.float32), (uavs,)) for name, value in (defaults | values).items()
-    }
+        names = ", ".join((*UAV_FIELDS, "start_m", "present"))
+        raise TypeError(f"{sorted(unknown)[0]} is not a field of a fleet; fields are {names}")
+    fields = {name: _one_each(name, value, (uavs,)) for name, value in (defaults | values).items()}
     for name, value in fields.items():
-        lowest = 0.0 if name == "flying_power_w" else math.nextafter(0.0, 1.0)
-        _check(name, value, "UAV", "positive" if lowest else "at least 0", lambda v, low=lowest: v >= low)
+        _check(name, value, "UAV", *(_AT_LEAST_0 if name == "flying_power_w" else _POSITIVE))
+    start = _one_each("start_m", start, (uavs, 2))
+    _check("start_m", start, "UAV", *_FINITE)
     return Fleet(
         **fields,
-        start_m=jnp.broadcast_to(jnp.asarray(start, jnp.float32), (uavs, 2)),
-        present=None if present is None else jnp.asarray(present, bool),
+        start_m=start,
+        present=None if present is None else _one_each("present", present, (uavs,), bool),
     )
 
 
@@ -125,22 +128,26 @@ def make_depots(
         power_w: charging power per UAV, W.
 
     Raises:
-        ValueError: a kind is unknown or a number is out of range, one line that names the field.
+        ValueError: a kind is unknown, a number is out of range, or there are too few or too many, one line that names the
+            field.
     """
     position = jnp.asarray(position, jnp.float32).reshape(-1, 2)
     count = position.shape[0]
     kinds = [kind] * count if isinstance(kind, str) else list(kind)
+    if len(kinds) != count:
+        raise ValueError(f"kind has {len(kinds)} values; give one for all or {count}, one per depot")
     names = [member.name.lower() for member in DepotKind]
     for number, name in enumerate(kinds, 1):
         if name not in names:
             raise ValueError(f"kind of depot {number} is {name!r}; give {' or '.join(map(repr, names))}")
     numbers = {
-        name: jnp.broadcast_to(jnp.asarray(value, jnp.float32), (count,))
+        name: _one_each(name, value, (count,))
         for name, value in (("pads", pads), ("packs", packs), ("power_w", power_w))
     }
+    _check("position", position, "depot", *_FINITE)
     _check("pads", numbers["pads"], "depot", "at least 1", lambda value: value >= 1)
     for name in ("packs", "power_w"):
-        _check(name, numbers[name], "depot", "at least 0", lambda value: value >= 0)
+        _check(name, numbers[name], "depot", *_AT_LEAST_0)
     return Depots(position=position, kind=jnp.asarray([names.index(name) for name in kinds], jnp.int32), **numbers)
 
 
@@ -151,10 +158,24 @@ def default_start(uavs: int, depots: Depots | None) -> Float[Array, "K 2"]:
     return depots.position[np.arange(uavs) % depots.kind.shape[-1]]
 
 
-def _check(name: str, values: Array, vehicle: str, expected: str, fits: Any) -> None:
-    """Check values that are known; traced ones are the caller's responsibility."""
+def _one_each(name: str, value: Any, shape: tuple[int, ...], dtype: Any = jnp.float32) -> Array:
+    """Return one value for each UAV or depot, given one for all or one for each."""
+    array = jnp.asarray(value, dtype)
+    if array.shape not in (shape, shape[1:]):
+        raise ValueError(f"{name} has shape {array.shape}; it should be {shape}, or {shape[1:]} for all alike")
+    return jnp.broadcast_to(array, shape)
+
+
+_FINITE: _Range = ("finite", math.isfinite)
+_AT_LEAST_0: _Range = ("at least 0", lambda value: value >= 0)
+_POSITIVE: _Range = ("positive", lambda value: value > 0)
+
+
+def _check(name: str, values: Array, what: str, expected: str, fits: Callable[[float], bool]) -> None:
+    """Check the values of each UAV or depot that are known; traced ones are the caller's responsibility."""
     if isinstance(values, jax.core.Tracer):
         return
-    for number, value in enumerate(np.asarray(values).tolist(), 1):
-        if math.isnan(value) or not fits(value):
-            raise ValueError(f"{name} of {vehicle} {number} is {value:g}; it should be {expected}")
+    for number, row in enumerate(np.asarray(values), 1):
+        for value in np.ravel(row).tolist():
+            if math.isnan(value) or not fits(value):
+                raise ValueError(f"{name} of {what} {number} is {value:g}; it should be {expected}")

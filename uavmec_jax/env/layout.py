@@ -108,11 +108,27 @@ class Layout:
         weight = jnp.ones(self.capacity.shape) if self.priority is None else self.priority
         return weight if self.present is None else jnp.where(self.present, weight, 0.0)
 
+    def sends_results(self) -> Bool[Array, "*batch n"]:
+        """Return the devices that send results by themselves: connected, and not padding."""
+        return self.has_comms if self.present is None else self.has_comms & self.present
+
     def failure_price(self, seconds: Num[ArrayLike, ""]) -> Float[Array, " n"]:
         """Return the price of each device's first failure, in slots of lifetime, at a time as in :meth:`Traffic.at`."""
         if self.traffic is None:
             return jnp.zeros(self.capacity.shape)
         return self.traffic.price * self.traffic.at(seconds)
+
+
+def check_one_uav(layout: Layout, what: str) -> None:
+    """Check that there is one UAV without depots, for the sake of ``what``, which knows nothing else.
+
+    Raises:
+        ValueError: there are several, or depots; one line.
+    """
+    if layout.action_shape or layout.n_depots:
+        uavs, depots = layout.n_uavs, layout.n_depots
+        has = f"{uavs} UAV{'s' * (uavs != 1)} and {depots} depot{'s' * (depots != 1)}"
+        raise ValueError(f"the layout has {has}; {what} is for one UAV without depots")
 
 
 def fleet_of(params: Params, layout: Layout) -> Fleet:

@@ -41,12 +41,17 @@ def make_weights(terms: Mapping[str, float]) -> np.ndarray:
     weights = np.zeros(len(TERMS), np.float32)
     for term, weight in terms.items():
         if term not in TERMS:
-            raise ValueError(f"unknown reward term {term!r}; terms are {', '.join(TERMS)}")
-        if not np.isfinite(weight):
-            raise ValueError(f"weight of reward term {term!r} is {weight}; it must be a finite number")
-        weights[TERMS.index(term)] = weight
+            raise ValueError(f"unknown reward term {term!r}; terms are {', '.join((*TERMS, SERVICE_TERM))}")
+        weights[TERMS.index(term)] = _finite(term, weight)
     weights.setflags(write=False)
     return weights
+
+
+def _finite(term: str, weight: float) -> float:
+    """Return the weight of a term, which has to be finite."""
+    if not np.isfinite(weight):
+        raise ValueError(f"weight of reward term {term!r} is {weight}; it must be a finite number")
+    return weight
 
 
 DEFAULT_REWARD = "U+log(A/O)"
@@ -134,7 +139,7 @@ def make_reward(
     else:
         weights = make_weights({term: weight for term, weight in reward.items() if term != SERVICE_TERM})
         if SERVICE_TERM in reward:
-            service = jnp.float32(reward[SERVICE_TERM])
+            service = jnp.float32(_finite(SERVICE_TERM, reward[SERVICE_TERM]))
     return Reward(weights=jnp.asarray(weights), service=service, **common)
 
 
@@ -171,7 +176,8 @@ def check_guard(reward: Reward, layout: Layout) -> None:
     ages = np.asarray(reward.weights)[..., [TERMS.index("log A"), TERMS.index("log O")]]
     if np.any(np.any(ages != 0, axis=-1) & ~np.asarray(reward.log1p)):
         raise ValueError(
-            "the reward has log A or log O, and there are depots, where no age is visited; take guard='log1p'"
+            "the reward has log A or log O and the guard clamp, but with depots A is 0 when every UAV is at one; "
+            "give guard='log1p'"
         )
 
 

@@ -72,8 +72,7 @@ def plan_flights(
     slant = jnp.sqrt(jnp.sum(ground**2, axis=-1) + params.uav_altitude_m**2)
     covers = (slant <= fleet.signal_range_m[:, None]) | (jnp.arange(n) == target[:, None])
     t_compute = jnp.minimum(volumes / layout.processing_rate, params.slot_cap_s)
-    sends = layout.has_comms if layout.present is None else layout.has_comms & layout.present
-    t_results = jnp.where(sends, 8.0 * params.result_message_bytes / params.uplink_rate_bit_s, 0.0)
+    t_results = jnp.where(layout.sends_results(), 8.0 * params.result_message_bytes / params.uplink_rate_bit_s, 0.0)
     return Flights(
         place=place,
         hovers=hovers,

@@ -8,6 +8,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from uavmec_jax.env.dynamics import State
 from uavmec_jax.env.environment import UavMecEnv
+from uavmec_jax.env.layout import check_one_uav
 from uavmec_jax.env.scenario import Scenario, make_scenario
 
 
@@ -64,4 +65,6 @@ class FiveValueEnv:
         """Return gymnax's ``Discrete``: the device to visit."""
         from gymnax.environments import spaces
 
-        return spaces.Discrete(self._env.num_actions((params or self.default_params).scenario))
+        scenario = (params or self.default_params).scenario
+        check_one_uav(scenario.layout, "this interface")
+        return spaces.Discrete(self._env.num_actions(scenario))

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
 from uavmec_jax.env.dynamics import Cause, State, initial_state
+from uavmec_jax.env.layout import check_one_uav
 from uavmec_jax.env.observation import observe
 from uavmec_jax.env.scenario import Scenario, advance, draw_volumes, is_truncated, make_scenario
 
@@ -18,10 +19,16 @@ def make_spaces(scenario: Scenario) -> tuple[gymnasium.spaces.Box, gymnasium.spa
     """Return the spaces of observations and actions of a scenario, or of one of a batch.
 
     Observations are ``[2n]``: n battery fractions in [0, 1], then n data ages from 0 to the limit + 1. The action is the
-    device to visit.
+    device to visit. Where an episode goes on after a failure, ages have no limit.
+
+    Raises:
+        ValueError: the layout has several UAVs or depots.
     """
+    check_one_uav(scenario.layout, "this interface")
     n = scenario.layout.capacity.shape[-1]
     max_age = float(np.max(scenario.params.data_age_limit_slots)) + 1.0
+    if scenario.params.end == "horizon":
+        max_age = np.inf
     high = np.concatenate([np.ones(n, np.float32), np.full(n, max_age, np.float32)])
     return gymnasium.spaces.Box(np.zeros(2 * n, np.float32), high, dtype=np.float32), gymnasium.spaces.Discrete(n)
 
@@ -44,7 +51,7 @@ class UavMecGymEnv(gymnasium.Env):
             render_mode: ``None`` or ``"rgb_array"``.
 
         Raises:
-            ValueError: the render mode is another one.
+            ValueError: the render mode is another one, or the layout has several UAVs or depots.
         """
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode is {render_mode!r}; it should be None or 'rgb_array'")

@@ -7,8 +7,9 @@ from .beam import beam_search as beam_search
 from .bound import upper_bound as upper_bound
 from .bound import upper_bounds as upper_bounds
 from .changes import WhatIf as WhatIf
-from .deadlines import earliest_deadline as earliest_deadline
-from .fleet_demand import horizon as horizon
+from .fleet_deadlines import earliest_deadline as earliest_deadline
+from .fleet_deadlines import split_deadline as split_deadline
+from .fleet_demand import planned_slots as planned_slots
 from .forecast import Forecast as Forecast
 from .forecast import make_forecast as make_forecast
 from .heuristics import FLEET_HEURISTICS as FLEET_HEURISTICS

@@ -18,7 +18,7 @@ from uavmec_jax.env.dynamics import State, complete_state, initial_state
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Episode, Policy, rollout_from, trace_from
-from uavmec_jax.planning.changes import WhatIf, layouts_to_try, rank_changes
+from uavmec_jax.planning.changes import WhatIf, layouts_to_try, rank_changes, states_to_try
 from uavmec_jax.planning.forecast import SAMPLES, Forecast
 from uavmec_jax.planning.rollout_planner import candidates_of, prefer, try_candidates, values_of
 
@@ -34,7 +34,7 @@ class Candidate:
     """One place as the next target.
 
     Attributes:
-        device: index of the place from 0: a device, or behind the devices a depot.
+        place: index of the place from 0: a device, or behind the devices a depot.
         lifetime: slots, mean over the futures if the UAV flies there next and the policy decides from then on.
         behind: slots by which the best candidate's value exceeds this one's on the same futures. The value of a future is
             its lifetime minus the price of its first failure, if the layout's traffic has prices; for fleets, the last slot
@@ -44,7 +44,7 @@ class Candidate:
         service: with ``end = "horizon"``, that share, mean over the futures; else ``None``.
     """
 
-    device: int
+    place: int
     lifetime: float
     behind: float
     behind_low: float
@@ -72,7 +72,7 @@ class UavAdvice:
     @property
     def place(self) -> int:
         """Index of the place to fly to next."""
-        return self.candidates[0].device
+        return self.candidates[0].place
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class Advice:
         return self.uavs[0].policy_choice
 
     @property
-    def device(self) -> int:
+    def place(self) -> int:
         """Index of the place to fly to next for the only UAV, or the first one."""
         return self.uavs[0].place
 
@@ -115,7 +115,8 @@ def advise(
     samples: int = SAMPLES,
     what_if: bool = False,
 ) -> Advice:
-    """Recommend the next targets: those with the highest mean lifetime minus the price of the first failure.
+    """Recommend the next targets: those with the highest mean lifetime minus the price of the first failure; with a horizon,
+    those with which the devices are in service longest.
 
     UAVs decide one after the other, as in :func:`rollout_planner`. The simulation is compiled once per policy, numbers of
     devices, UAVs and depots, and number of futures.
@@ -227,15 +228,19 @@ def _try_changes(
     policy: Policy, params: Params, layout: Layout, state: State, futures: Key[Array, " S"]
 ) -> tuple[WhatIf, ...]:
     """Return the effect of every change of one device if the policy decides from the present state on."""
-    episodes = _play_layouts(policy, params, layouts_to_try(params, layout), state, futures)
+    goes_on = params.end == "horizon"
+    states = states_to_try(layout, state) if goes_on else state
+    episodes = _play_layouts(policy, params, layouts_to_try(params, layout), states, futures, 0 if goes_on else None)
     return rank_changes(params, layout, episodes, _seconds_left(params, state))
 
 
-@partial(jax.jit, static_argnames="policy")
-def _play_layouts(policy: Policy, params: Params, layouts: Layout, state: State, futures: Key[Array, " S"]) -> Episode:
-    """Return the episode of every future for each of ``L`` layouts, leaves ``[L, S, ...]``."""
-    play = lambda layout, future: rollout_from(policy, params, layout, state, future)  # noqa: E731
-    return jax.vmap(jax.vmap(play, (None, 0)), (0, None))(layouts, futures)
+@partial(jax.jit, static_argnames=("policy", "states_axis"))
+def _play_layouts(
+    policy: Policy, params: Params, layouts: Layout, states: State, futures: Key[Array, " S"], states_axis: int | None
+) -> Episode:
+    """Return the episode of every future for each of ``L`` layouts, leaves ``[L, S, ...]``, from one state or ``L``."""
+    play = lambda layout, state, future: rollout_from(policy, params, layout, state, future)  # noqa: E731
+    return jax.vmap(jax.vmap(play, (None, None, 0)), (0, states_axis, None))(layouts, states, futures)
 
 
 def _rank(
@@ -245,15 +250,15 @@ def _rank(
     behind = value[best] - value
     futures = value.shape[1]
     half_width = 1.96 * behind.std(axis=1, ddof=min(1, futures - 1)) / np.sqrt(futures)
-    order = sorted(range(len(value)), key=lambda device: (device != best, -value[device].mean(), device))
+    order = sorted(range(len(value)), key=lambda place: (place != best, -value[place].mean(), place))
     return tuple(
         Candidate(
-            device=device,
-            lifetime=float(lifetimes[device].mean()),
-            behind=float(behind[device].mean()),
-            behind_low=float(behind[device].mean() - half_width[device]),
-            behind_high=float(behind[device].mean() + half_width[device]),
-            service=float(value[device].mean()) if values_are_shares else None,
+            place=place,
+            lifetime=float(lifetimes[place].mean()),
+            behind=float(behind[place].mean()),
+            behind_low=float(behind[place].mean() - half_width[place]),
+            behind_high=float(behind[place].mean() + half_width[place]),
+            service=float(value[place].mean()) if values_are_shares else None,
         )
-        for device in order
+        for place in order
     )

@@ -81,13 +81,18 @@ def beam_search(
     Args:
         params: scenario parameters.
         layout: the devices.
-        volumes: bytes, the tasks of every slot; ``H`` from :func:`fleet_demand.horizon`.
+        volumes: bytes, the tasks of every slot; ``H`` from :func:`fleet_demand.planned_slots`.
         width: states kept per slot; static.
         upper_bound: slots, a known upper bound on the lifetime, from which the search then starts.
         value_fn: scores the states that are not pruned with a proof, e.g. a learned critic; by default, the score is
             high where the visits still needed take a small share of the remaining slots.
+
+    Raises:
+        ValueError: episodes do not end with the first failure.
     """
     chex.assert_shape(volumes, (None, layout.capacity.shape[0]))
+    if params.end != "first_failure":
+        raise ValueError(f"end is {params.end!r}; the beam searches for the longest time to the 'first_failure'")
     problem = make_problem(params, layout, volumes, value_fn)
     bound = counting_bound(params, layout, problem.costs)
     bound = bound if upper_bound is None else jnp.minimum(bound, upper_bound)

@@ -57,7 +57,7 @@ def upper_bound(params: Params, layout: Layout, volumes: Num[Array, "H n"], reac
     Args:
         params: scenario parameters.
         layout: the devices, the UAVs and the depots.
-        volumes: bytes, ``H`` from :func:`uavmec_jax.planning.fleet_demand.horizon`.
+        volumes: bytes, ``H`` from :func:`uavmec_jax.planning.fleet_demand.planned_slots`.
         reached: a lifetime that some policy reaches; the search starts there and is short if it is optimal.
 
     Raises:

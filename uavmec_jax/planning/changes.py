@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Num
 
+from uavmec_jax.env.dynamics import State
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Episode
@@ -76,6 +77,25 @@ def layouts_to_try(params: Params, layout: Layout) -> Layout:
     marked = replace(layout, present=_marked(layout), priority=weight)
     ignored = [replace(marked, priority=weight.at[device].set(0.0)) for device in range(layout.n_devices)]
     return _stack([marked, *every_change(marked), *ignored])
+
+
+def states_to_try(layout: Layout, state: State) -> State:
+    """Return the state from which each of :func:`layouts_to_try` with a horizon goes on, leaves ``[L, ...]``.
+
+    They are all ``state``, except that whoever repairs the power of a dead device replaces its battery.
+    """
+    full = jnp.asarray(layout.capacity, jnp.float32)
+
+    def repaired(device: int) -> State:
+        at = state.failed_at[device]
+        battery = jnp.where(at < 0, state.battery[device], full[device])
+        return replace(
+            state, battery=state.battery.at[device].set(battery), failed_at=state.failed_at.at[device].set(-1)
+        )
+
+    devices = range(layout.n_devices)
+    others = [state] * (len(CHANGES) * layout.n_devices)  # the other changes, and the devices that weigh nothing
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), state, *map(repaired, devices), *others)
 
 
 def _marked(layout: Layout) -> jax.Array:

@@ -64,7 +64,8 @@ def work_times(
 ) -> tuple[Float[Array, "H n"], Float[Array, " n"]]:
     """Return the seconds that each device computes if it is not served, and those in which it then sends its results."""
     t_compute = jnp.minimum(volumes / layout.processing_rate, params.slot_cap_s)
-    return t_compute, jnp.where(layout.has_comms, 8.0 * params.result_message_bytes / params.uplink_rate_bit_s, 0.0)
+    t_results = 8.0 * params.result_message_bytes / params.uplink_rate_bit_s
+    return t_compute, jnp.where(layout.sends_results(), t_results, 0.0)
 
 
 def _slant(params: Params, layout: Layout) -> Float[Array, "n n"]:

@@ -25,7 +25,7 @@ _ROUNDING = 1e-5
 """Relative tolerance for single precision, always applied in favour of the network."""
 
 
-def horizon(params: Params, layouts: Layout) -> int:
+def planned_slots(params: Params, layouts: Layout) -> int:
     """Return the number of slots to plan for: a power of two, at least 64, that no lifetime exceeds.
 
     Args:

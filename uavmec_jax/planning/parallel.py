@@ -45,7 +45,7 @@ def beam_episodes(
         params: leaves ``[B]``.
         layouts: leaves ``[B, n]``.
         keys: volume draws.
-        slots: from :func:`uavmec_jax.planning.fleet_demand.horizon`.
+        slots: from :func:`uavmec_jax.planning.fleet_demand.planned_slots`.
         width: states kept per slot.
         value_fn: see :func:`beam_search`.
     """
@@ -116,7 +116,7 @@ def bound_scenarios(
         layouts: leaves ``[B, n]``.
         keys: volume draws.
         reached: lifetimes that some policy reaches.
-        slots: from :func:`uavmec_jax.planning.fleet_demand.horizon`.
+        slots: from :func:`uavmec_jax.planning.fleet_demand.planned_slots`.
     """
     return upper_bounds(params, layouts, _volume_tables(params, layouts, keys, slots), reached)
 

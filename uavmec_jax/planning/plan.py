@@ -17,7 +17,7 @@ from uavmec_jax.env.rollout import Episode, Trace, tour_policy, trace
 from uavmec_jax.planning import beam
 from uavmec_jax.planning.changes import WhatIf, layouts_to_try, rank_changes
 from uavmec_jax.planning.fleet_deadlines import earliest_deadline
-from uavmec_jax.planning.fleet_demand import horizon, is_alone
+from uavmec_jax.planning.fleet_demand import is_alone, planned_slots
 from uavmec_jax.planning.forecast import Forecast
 from uavmec_jax.planning.heuristics import FLEET_HEURISTICS, HEURISTICS
 from uavmec_jax.planning.parallel import (
@@ -102,7 +102,7 @@ def make_plan(
         per_layout, layouts, all_draws = _with_changes(params, layout, draws)
     else:
         per_layout, layouts, all_draws = per_draw, unchanged, draws
-    slots = min(int(params.max_slots), _MOST_RECORDED) if goes_on else horizon(per_layout, layouts)
+    slots = min(int(params.max_slots), _MOST_RECORDED) if goes_on else planned_slots(per_layout, layouts)
     planned, tried = rollout_planner_episodes(per_layout, layouts, all_draws, slots=slots, samples=samples)
     tours, episodes = {"rollout": planned[:count]}, _heuristics(params, layout, draws)
     episodes["rollout"] = jax.tree.map(lambda leaf: np.asarray(leaf[:count]), tried)

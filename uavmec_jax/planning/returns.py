@@ -145,8 +145,9 @@ def _longest_slot(
 ) -> Float[Array, ""]:
     """Return the seconds that no slot exceeds, wherever the UAVs fly."""
     present, flies = _present(layout), ~state.grounded
-    sends = jnp.any(layout.has_comms & present)
-    t_results = jnp.where(sends, 8.0 * params.result_message_bytes / params.uplink_rate_bit_s, 0.0)
+    t_results = jnp.where(
+        jnp.any(layout.sends_results()), 8.0 * params.result_message_bytes / params.uplink_rate_bit_s, 0.0
+    )
     distance = jnp.linalg.norm(layout.places() - state.uav_position[:, None], axis=-1)
     t_fly = distance / fleet.speed_m_s[:, None]
     goals = flies[:, None] & jnp.concatenate([present, helps])

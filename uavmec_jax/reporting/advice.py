@@ -23,7 +23,7 @@ _CAUSES = {
     Cause.UAV: "the UAV's battery",
     Cause.NONE: "the time limit",
     Cause.HORIZON: "the horizon",
-    Cause.SHARE: "too many devices out of power",
+    Cause.SHARE: "too many dead devices",
 }
 
 
@@ -70,12 +70,12 @@ def _next_data(advice: Advice, scenario: NamedScenario) -> dict[str, Any]:
     """Return what the only UAV does next, as plain data."""
     names = scenario.device_names
     return {
-        "next": {"device": advice.device + 1, "name": names[advice.device]},
+        "next": {"device": advice.place + 1, "name": names[advice.place]},
         "policy_says": {"device": advice.policy_choice + 1, "name": names[advice.policy_choice]},
         "ranking": [
             {
-                "device": candidate.device + 1,
-                "name": names[candidate.device],
+                "device": candidate.place + 1,
+                "name": names[candidate.place],
                 "lifetime": round(candidate.lifetime, 4),
                 "behind": round(candidate.behind, 4),
                 "behind_interval": [round(candidate.behind_low, 4), round(candidate.behind_high, 4)],
@@ -132,8 +132,8 @@ def _ranking_table(advice: Advice, scenario: NamedScenario) -> Table:
     for rank, candidate in enumerate(advice.candidates[:_MAX_ROWS], 1):
         half = (candidate.behind_high - candidate.behind_low) / 2
         behind = f"{candidate.behind:.2f} ±{half:.2f}" if rank > 1 else "-"
-        note = "the policy's choice" if candidate.device == advice.policy_choice else ""
-        label = device_label(candidate.device + 1, names[candidate.device])
+        note = "the policy's choice" if candidate.place == advice.policy_choice else ""
+        label = device_label(candidate.place + 1, names[candidate.place])
         table.add_row(str(rank), label, f"{candidate.lifetime:.2f}", behind, note)
     return table
 
@@ -157,7 +157,7 @@ def advice_lines(advice: Advice, scenario: NamedScenario) -> list[str]:
     """Return the lines below the tables: the next visits, the expected lifetime or service, and what ends it."""
     forecast, words = advice.forecast, _CAUSES
     if as_in_paper(scenario):
-        label = device_label(advice.device + 1, scenario.device_names[advice.device])
+        label = device_label(advice.place + 1, scenario.device_names[advice.place])
         return [f"Next: {label}. {_lifetime_line(forecast, words)}"]
     words = words | {Cause.UAV: "the UAVs' batteries"}
     lines = fleet_next_lines(advice, scenario)
@@ -174,7 +174,8 @@ def advice_lines(advice: Advice, scenario: NamedScenario) -> list[str]:
 def _lifetime_line(forecast: Forecast, words: dict[Cause, str]) -> str:
     lifetimes, (low, high) = forecast.lifetimes, forecast.interval
     causes = ", ".join(f"{words[cause]} {share:.0%}" for cause, share in forecast.causes.items())
+    at_least = "at least " if forecast.causes.get(Cause.NONE) else ""  # futures that the time limit ends
     return (
-        f"The network then lives {lifetimes.mean():.1f} slots on average, {low:.0f} to {high:.0f} in 95 % of "
+        f"The network then lives {at_least}{lifetimes.mean():.1f} slots on average, {low:.0f} to {high:.0f} in 95 % of "
         f"{len(lifetimes)} futures. What ends it: {causes}."
     )

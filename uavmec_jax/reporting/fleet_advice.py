@@ -76,7 +76,7 @@ def fleet_next_data(advice: Advice, scenario: NamedScenario) -> dict[str, Any]:
                 if math.isnan(uav.returns_in)
                 else {"slots": uav.returns_in, "seconds": round(uav.returns_in_s, 1)},
                 "ranking": [
-                    {"place": candidate.device + 1, "name": names[candidate.device], **_value(candidate)}
+                    {"place": candidate.place + 1, "name": names[candidate.place], **_value(candidate)}
                     for candidate in uav.candidates
                 ],
             }
@@ -108,9 +108,9 @@ def fleet_next_table(advice: Advice, scenario: NamedScenario) -> Table:
             table.add_row(
                 name if rank == 1 else "",
                 str(rank),
-                _do(scenario, candidate.device, action if rank == 1 else None),
+                _do(scenario, candidate.place, action if rank == 1 else None),
                 *_numbers(candidate, rank),
-                "yes" if candidate.device == uav.policy_choice else "",
+                "yes" if candidate.place == uav.policy_choice else "",
                 end_section=rank == min(_RANKS, len(uav.candidates)),
             )
             if action == "grounded":

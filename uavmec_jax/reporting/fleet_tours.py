@@ -15,6 +15,7 @@ from uavmec_jax.env.measures import UavSlots, seconds_until_horizon, uav_slots
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Trace
 from uavmec_jax.reporting.labels import device_label, hours
+from uavmec_jax.reporting.tours import targets
 from uavmec_jax.scenarios.named_scenario import NamedScenario
 
 _MAX_COLUMNS = 4
@@ -34,7 +35,7 @@ def fleet_rows(params: Params, layout: Layout, scenario: NamedScenario, tour: Tr
     works = tour.state.failed_at < 0
     fraction = np.where(works, tour.state.battery / layout.capacity, np.inf)
     age = np.where(works, tour.state.age, -1)
-    action, elapsed = tour.action.reshape(len(tour.action), -1), np.asarray(tour.state.elapsed)
+    action, elapsed = targets(tour), np.asarray(tour.state.elapsed)
     return [
         {
             "slot": slot + 1,
@@ -49,7 +50,7 @@ def fleet_rows(params: Params, layout: Layout, scenario: NamedScenario, tour: Tr
                 "fraction": float(fraction[slot].min()) if works[slot].any() else 0.0,
             },
             "oldest_data": {"device": int(age[slot].argmax()) + 1, "slots": max(int(age[slot].max()), 0)},
-            "out_of_power": [int(device) + 1 for device in np.flatnonzero(~works[slot])],
+            "dead": [int(device) + 1 for device in np.flatnonzero(~works[slot])],
         }
         for slot in range(len(action))
     ]
@@ -58,7 +59,7 @@ def fleet_rows(params: Params, layout: Layout, scenario: NamedScenario, tour: Tr
 def _uav_row(
     layout: Layout, scenario: NamedScenario, tour: Trace, did: UavSlots, slot: int, v: int, place: int
 ) -> dict[str, Any]:
-    """Return what a UAV does in a slot."""
+    """Return what a UAV does in a slot; its target is ``None`` if it is grounded."""
     depots, depot, service = layout.depots, int(did.depot[slot, v]), None
     if did.swapped[slot, v]:
         service = "swap"
@@ -66,8 +67,8 @@ def _uav_row(
         service = "charge"
     return {
         "name": scenario.uav_names[v],
-        "target": scenario.place_names[place],
-        "place": place + 1,
+        "target": scenario.place_names[place] if place >= 0 else None,
+        "place": place + 1 if place >= 0 else None,
         "flies": bool(did.flew[slot, v]),
         "energy_j": float(tour.state.uav_energy[slot, v]),
         "at_depot": scenario.depot_names[depot] if depot >= 0 else None,
@@ -92,7 +93,7 @@ def fleet_table(rows: Sequence[dict[str, Any]], scenario: NamedScenario) -> Tabl
         table.add_column(column, justify="right", no_wrap=True)
     for name in uavs:
         table.add_column(f"{name}\nat, kJ", no_wrap=True)
-    any_out = any(row["out_of_power"] for row in rows)
+    any_out = any(row["dead"] for row in rows)
     for column in ("served", "lowest\nbattery", "oldest\ndata", *["empty"] * any_out):
         lists = column in ("served", "empty")
         table.add_column(column, justify="left" if lists else "right", no_wrap=not lists)
@@ -107,7 +108,7 @@ def fleet_table(rows: Sequence[dict[str, Any]], scenario: NamedScenario) -> Tabl
             _numbers(last["served"]),
             f"#{battery['device']} {battery['fraction']:.0%}",
             f"#{data['device']} {data['slots']}" if data["slots"] else "-",
-            *[_numbers(last["out_of_power"])] * any_out,
+            *[_numbers(last["dead"])] * any_out,
         )
     return table
 
@@ -136,7 +137,7 @@ def _groups(rows: Sequence[dict[str, Any]]) -> list[list[dict[str, Any]]]:
 
 def _what_happens(row: dict[str, Any]) -> tuple:
     uavs = tuple((uav["place"], uav["at_depot"], uav["depot_service"], uav["grounded"]) for uav in row["uavs"])
-    return uavs, tuple(row["served"]), tuple(row["out_of_power"])
+    return uavs, tuple(row["served"]), tuple(row["dead"])
 
 
 def _uav_cell(scenario: NamedScenario, uav: dict[str, Any]) -> str:

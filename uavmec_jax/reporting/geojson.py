@@ -8,7 +8,7 @@ import numpy as np
 from uavmec_jax.env.fleet import DepotKind
 from uavmec_jax.env.rollout import Trace
 from uavmec_jax.planning.plan import Plan
-from uavmec_jax.reporting.tours import uav_stops
+from uavmec_jax.reporting.tours import targets, uav_stops
 from uavmec_jax.scenarios.named_scenario import NamedScenario
 
 
@@ -31,7 +31,10 @@ def tour_geojson(scenario: NamedScenario, plan: Plan) -> dict[str, Any]:
 def _devices(scenario: NamedScenario, plan: Plan) -> list[dict[str, Any]]:
     """Return the devices; visits count the slots in which a UAV flies to them, or stays."""
     devices = scenario.geographic(np.asarray(plan.layout.position))
-    visits = {name: np.bincount(tour.action.reshape(-1), minlength=len(devices)) for name, tour in plan.tours.items()}
+    visits = {
+        name: np.bincount(1 + targets(tour).reshape(-1), minlength=1 + len(devices))[1:]
+        for name, tour in plan.tours.items()
+    }
     priority = plan.layout.priority
     return [
         _feature(
@@ -83,7 +86,7 @@ def _line(scenario: NamedScenario, plan: Plan, name: str, tour: Trace, uav: int)
     moved = np.append(True, np.any(np.diff(stops, axis=0) != 0, axis=1))
     path = scenario.geographic(stops[moved]).tolist()
     path = path if len(path) > 1 else path * 2  # a line has at least two positions
-    places = [int(place) + 1 for place in tour.action.reshape(len(tour.action), -1)[:, uav]]
+    places = [int(place) + 1 for place in targets(tour)[:, uav] if place >= 0]
     properties: dict[str, Any] = {"tour": name}
     if plan.as_in_paper:
         properties["devices"] = places

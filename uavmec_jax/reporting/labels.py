@@ -25,4 +25,5 @@ def hours(seconds: float) -> str:
 
 def duration(seconds: float) -> str:
     """Return a time in words, e.g. ``50 min`` or ``2.5 h``."""
-    return f"{seconds / 60:.2g} min" if seconds < 5400 else f"{seconds / 3600:.2g} h"
+    number, unit = (seconds / 60, "min") if seconds < 5400 else (seconds / 3600, "h")
+    return f"{number:.1f}".removesuffix(".0") + f" {unit}"

@@ -35,7 +35,7 @@ _CAUSES = {
     Cause.UAV: "the UAV's battery runs out",
     Cause.NONE: "the time limit ends it",
     Cause.HORIZON: "the time is over",
-    Cause.SHARE: "the time is over",
+    Cause.SHARE: "too many devices are dead",
 }
 _TOUR_TITLES = {
     "rollout": "The rollout planner's tour (knows no volumes in advance), first draw",

@@ -63,13 +63,13 @@ def measure_data(measures: ServiceMeasures) -> dict[str, Any]:
     working = np.isfinite(measures.mean_age)
     return {
         "first_failure_slot": float(measures.first_failure_slot[fails].mean()) if fails.any() else None,
-        "first_failure_share": float(fails.mean()),
+        "failure_share": float(fails.mean()),
         "in_service": float(measures.in_service.mean()),
-        "mean_age_slots": float(measures.mean_age[working].mean()) if working.any() else None,
-        "age_95_slots": float(measures.age_95[working].mean()) if working.any() else None,
+        "mean_age": float(measures.mean_age[working].mean()) if working.any() else None,
+        "age_95": float(measures.age_95[working].mean()) if working.any() else None,
         "flights": float(measures.flights.mean()),
-        "uav_energy_j": float(measures.energy_used_j.mean()),
-        "packs": float(measures.packs_used.mean()),
+        "energy_used_j": float(measures.energy_used_j.mean()),
+        "packs_used": float(measures.packs_used.mean()),
     }
 
 
@@ -84,12 +84,12 @@ def measure_table(measures: ServiceMeasures, *, depots: bool) -> Table:
 
     add("slots to the first failure", data["first_failure_slot"], ".1f")
     add("devices in service", data["in_service"], ".1%")
-    add("age of the data of working devices", data["mean_age_slots"], ".2f", " slots")
-    add("95 % of these data are at most", data["age_95_slots"], ".1f", " slots old")
+    add("age of the data of working devices", data["mean_age"], ".2f", " slots")
+    add("95 % of these data are at most", data["age_95"], ".1f", " slots old")
     add("flights", data["flights"], ".1f")
-    add("energy that the UAVs used", data["uav_energy_j"] / 1e6, ".2f", " MJ")
+    add("energy that the UAVs used", data["energy_used_j"] / 1e6, ".2f", " MJ")
     if depots:
-        add("batteries swapped", data["packs"], ".1f")
+        add("batteries swapped", data["packs_used"], ".1f")
     return table
 
 

@@ -41,7 +41,7 @@ def by_fleet(results: Results) -> dict[str, Results]:
 
 
 def _fleet_title(study: Study) -> str:
-    depots = len(study.depots_there)
+    depots = len(study.used_depots)
     return f"{study.uavs} UAV{'s' * (study.uavs > 1)}, {depots} depot{'s' * (depots != 1)}: "
 
 
@@ -139,7 +139,7 @@ def _baselines(results: Results) -> list[str]:
 
 def _is_papers_fleet(results: Results) -> bool:
     """Return whether the fleet of a study is the paper's: one UAV, no depot."""
-    return results.study.uavs == 1 and not results.study.depots_there
+    return results.study.uavs == 1 and not results.study.used_depots
 
 
 def _lifetime(cell: Any, policy: str, baselines: list[str], with_paper: bool) -> Text:

@@ -12,7 +12,7 @@ from uavmec_jax.env.rollout import Trace
 from uavmec_jax.planning.plan import Plan
 from uavmec_jax.reporting.canvas import new_figure
 from uavmec_jax.reporting.map_figure import draw_depots, draw_devices, uav_colour
-from uavmec_jax.reporting.tours import uav_stops
+from uavmec_jax.reporting.tours import targets, uav_stops
 from uavmec_jax.scenarios.named_scenario import NamedScenario
 
 _TITLES = {"rollout": "rollout planner", "beam": "beam (clairvoyant)"}
@@ -84,7 +84,7 @@ def _draw_map(axis: Axes, plan: Plan, scenario: NamedScenario, tour: Trace, titl
         _draw_starts(axis, np.asarray(fleet_of(plan.params, layout).start_m))
     draw_devices(axis, layout)
     for device, (x, y) in enumerate(layout.position):
-        visits = int(np.sum(tour.action == device))
+        visits = int(np.sum(targets(tour) == device))
         axis.annotate(f"{visits}x", (x, y), xytext=(7, 5), textcoords="offset points", fontsize=7)
     axis.set_title(title, fontsize=10)
     axis.legend(fontsize=7, loc="best")

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from rich.table import Table
 
 from uavmec_jax.env.layout import fleet_of
@@ -58,6 +58,12 @@ def slot_rows(plan: Plan, names: Sequence[str], tour: Trace) -> list[dict[str, A
         }
         for slot, action in enumerate(tour.action)
     ]
+
+
+def targets(tour: Trace) -> Int[np.ndarray, "slots K"]:
+    """Return the place that each UAV flies to or stays at in each slot; -1 where it is grounded, whose action is ignored."""
+    action = np.asarray(tour.action).reshape(len(tour.action), -1)
+    return np.where(np.asarray(tour.state.grounded), -1, action)
 
 
 def uav_stops(plan: Plan, tour: Trace, uav: int) -> Float[np.ndarray, "stops 2"]:

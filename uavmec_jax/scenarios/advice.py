@@ -35,7 +35,7 @@ def advise_on(
     if isinstance(loaded, TrainedPolicy):
         differences = loaded.out_of_distribution(scenario.params, scenario.layout)
         warnings = [f"{scenario.name}: {difference}: {policy} may do worse here" for difference in differences]
-        warnings += [f"{scenario.name}: {line}" for line in loaded.lifted_to(scenario.layout)]
+        warnings += [f"{scenario.name}: {line}" for line in loaded.fleet_warnings(scenario.layout)]
     advice = advise(
         loaded,
         scenario.params,

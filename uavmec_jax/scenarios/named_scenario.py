@@ -100,10 +100,13 @@ class NamedScenario:
         """Return the scenario with a price on the first failure, in slots of lifetime; see :class:`um.Traffic`.
 
         Raises:
-            StateError: the price is negative or not finite, or the traffic of the devices is unknown.
+            StateError: the price is negative or not finite, the traffic of the devices is unknown, or the first failure is
+                not the end.
         """
         if not 0 <= price < np.inf:
             raise StateError(f"price is {price}; give slots, a finite number from 0")
+        if self.params.end == "horizon":
+            raise StateError(f"price is {price:g}, but end is 'horizon', where failures have no price; leave it out")
         if self.layout.traffic is None:
             raise StateError("price is given, but the traffic of these devices is unknown; give a place, e.g. albany")
         traffic = replace(self.layout.traffic, price=jnp.float32(price))

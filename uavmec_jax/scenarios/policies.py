@@ -95,7 +95,7 @@ class TrainedPolicy:
         """Return the device to visit, int32; the state may have any number of batch axes in front.
 
         The policy decides for one UAV. Several decide in turn by it, and return to depots as rules do (:func:`for_fleets`);
-        the result is then a place for each of them.
+        the result is then a place for each of them. Where episodes go on after a failure, it does not see dead devices.
 
         Raises:
             PolicyError: the layout has another number of devices.
@@ -104,22 +104,29 @@ class TrainedPolicy:
             raise PolicyError(
                 f"the policy was trained for {self.n_devices} devices; the layout has {layout.capacity.shape[-1]}"
             )
-        if is_alone(layout):
+        if is_alone(layout) and params.end == "first_failure":
             action: Array = self._policy(params, layout, state)
             return action
-        in_turn: Policy = for_fleets(self)
+        in_turn: Policy = for_fleets(self._decide)
         for _ in range(jnp.ndim(state.slot)):
             in_turn = jax.vmap(in_turn, (None, None, 0))
         return in_turn(params, layout, state)
 
-    def lifted_to(self, layout: Layout) -> list[str]:
+    def _decide(self, params: Params, layout: Layout, state: State, key: Any = None) -> Int[Array, ""]:
+        """Return the device that the only UAV visits."""
+        action: Array = self._policy(params, layout, state)
+        return action
+
+    def fleet_warnings(self, layout: Layout) -> list[str]:
         """Say in a line how the policy decides for several UAVs or with depots; nothing for one UAV without depots."""
         if is_alone(layout):
             return []
-        who = "the UAVs decide in turn by it and" if layout.n_uavs > 1 else "the UAV"
-        return [
-            f"the policy was trained for one UAV without depots; {who} return{'s' * (layout.n_uavs == 1)} by a rule"
-        ]
+        words = ["the policy was trained for one UAV without depots"]
+        if layout.n_uavs > 1:
+            words.append("here the UAVs decide one after another")
+        if layout.n_depots:
+            words.append("a rule sends UAVs to depots")
+        return ["; ".join(words)]
 
     def act(self, observation: Any) -> Int[np.ndarray, "*batch"]:
         """Return the device to visit, int32, for observations ``[..., obs_size]``.

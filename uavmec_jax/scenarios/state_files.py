@@ -84,6 +84,9 @@ def _build(file: StateFile, scenario: NamedScenario) -> State:
     battery = by_name("battery_j", file.battery_j, full, names, "device")
     age = by_name("age_slots", file.age_slots, np.asarray(initial.age), names, "device")
     _check_failures(file, failed_at, scenario)
+    horizon = float(scenario.params.horizon_s)
+    if scenario.params.end == "horizon" and file.elapsed_s >= horizon:
+        raise ValueError(f"elapsed_s is {file.elapsed_s:g}; the horizon is {horizon:g} s; give less")
     _check_devices(battery, age, failed_at, scenario)
     position, energy, grounded = uav_arrays(file, scenario)
     return State(

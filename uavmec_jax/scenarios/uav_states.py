@@ -142,10 +142,11 @@ def _position(field: str, uav: UavState, v: int, scenario: NamedScenario) -> Flo
 
 
 def _energy(field: str, uav: UavState, v: int, scenario: NamedScenario) -> float:
-    """Return the energy of UAV ``v``; the only UAV of a scenario without depots is done when it has none."""
+    """Return the energy of UAV ``v``; only where the episode then goes on may it be empty."""
     battery = float(np.asarray(fleet_of(scenario.params, scenario.layout).battery_j[v], float))
     energy = battery if uav.energy_j is None else uav.energy_j
-    may_be_empty = field != _ALONE
+    layout = scenario.layout
+    may_be_empty = layout.n_uavs > 1 or layout.n_depots > 0 or scenario.params.end == "horizon"
     if not 0 <= energy <= battery * (1 + 1e-6) or (energy == 0 and not may_be_empty):
         least = "from 0 to" if may_be_empty else "more than 0 and at most"
         raise ValueError(f"{field}energy_j is {energy:g}; give {least} {battery:g}")

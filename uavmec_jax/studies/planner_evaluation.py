@@ -13,7 +13,7 @@ from uavmec_jax.env.generator import ScenarioDistribution, scenario_from_draw
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.scenario import Scenario
-from uavmec_jax.planning.fleet_demand import horizon
+from uavmec_jax.planning.fleet_demand import planned_slots
 from uavmec_jax.planning.parallel import beam_episodes, bound_scenarios, rollout_planner_episodes
 from uavmec_jax.studies.evaluation_result import EvaluationResult, PlannerResult
 from uavmec_jax.studies.schema import CLAIRVOYANT, Evaluation
@@ -40,7 +40,7 @@ def evaluate_planners(
     results: dict[str, PlannerResult] = {}
     if "rollout" in settings.planners:
         params, layouts, flat = flatten_draws(agents.scenario, keys)
-        slots, samples = horizon(params, layouts), settings.rollout_samples
+        slots, samples = planned_slots(params, layouts), settings.rollout_samples
         _, episodes = rollout_planner_episodes(params, layouts, flat, slots=slots, samples=samples)
         results["rollout"] = PlannerResult.of(episodes, draws)
     reached = [lifetime[:, :draws] for lifetime in (*lifetimes, *(result.lifetime for result in results.values()))]
@@ -63,7 +63,7 @@ def _evaluate_clairvoyant(
         return results
     shape = keys.shape
     params, layouts, keys = flatten_draws(agents.scenario, keys)
-    slots = horizon(params, layouts)
+    slots = planned_slots(params, layouts)
     if "beam" in settings.planners:
         _, episodes = beam_episodes(params, layouts, keys, slots=slots, width=settings.beam_width)
         results["beam"] = PlannerResult.of(episodes, shape[1])

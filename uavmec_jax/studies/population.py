@@ -171,8 +171,8 @@ def _stack_rewards(rewards: list[Reward]) -> Reward:
 
 def _add_fleets(layouts: Layout, params: Params, study: Study) -> Layout:
     """Give agents' layouts, leaves ``[A, ...]``, the UAVs and the depots of a part; one UAV without depots is no fleet."""
-    position = np.array([(depot.x_m, depot.y_m) for depot in study.depots_there]).reshape(-1, 2)
-    depots = depots_of(study.depots_there, position)
+    position = np.array([(depot.x_m, depot.y_m) for depot in study.used_depots]).reshape(-1, 2)
+    depots = depots_of(study.used_depots, position)
     if study.uavs == 1 and depots is None:
         return layouts
     fleets = jax.vmap(lambda params: make_fleet(params, study.uavs, depots))(params)

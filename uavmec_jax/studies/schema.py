@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, get_args
 import pydantic
 from pydantic import Field
 
-from uavmec_jax.agents.registry import ALGORITHMS, SCENARIO_SETTINGS
+from uavmec_jax.agents.registry import ALGORITHMS, NO_HORIZON, SCENARIO_SETTINGS
 from uavmec_jax.env.fleet import MAX_UAVS
 from uavmec_jax.env.rewards import DEFAULT_REWARD, LOG_GUARDS
 from uavmec_jax.files.validation import StrictModel, from_array, model_from_dataclasses
@@ -125,7 +125,7 @@ class Study(StrictModel):
         return tuple(name for name in ALGORITHMS if isinstance(names, list) and name in names)
 
     @property
-    def depots_there(self) -> tuple[StudyDepot, ...]:
+    def used_depots(self) -> tuple[StudyDepot, ...]:
         """The depots of a study without the axis ``depots``."""
         return self.depot[: self.depots]
 
@@ -198,7 +198,7 @@ def _check_fleets(study: Study) -> None:
     check_depots(study.depot)
     if not (study.place or "place" in study.axes):
         check_inside(study.depot, study.params.region_m, "params.region_m")
-    there = study.axes.get("depots", [len(study.depots_there)])
+    there = study.axes.get("depots", [len(study.used_depots)])
     for name, values, least in (("uavs", study.axes.get("uavs", [study.uavs]), 1), ("depots", there, 0)):
         if max(values) == least:
             continue
@@ -216,13 +216,15 @@ def _check_fleets(study: Study) -> None:
 
 
 def _check_horizon(study: Study) -> None:
-    """Check that planners which know nothing but lifetimes are not asked about episodes that no failure ends."""
+    """Check that nothing that knows only lifetimes is asked about episodes that no failure ends."""
     asked = [name for name in study.evaluation.planners if name in CLAIRVOYANT]
     if study.params.end == "horizon" and asked:
         raise ValueError(
             f"evaluation.planners has {asked[0]!r}, which is about the first failure, and params.end is 'horizon'; give "
             "planners = ['rollout'] or []"
         )
+    if study.params.end == "horizon" and "dqn" in study.algorithms:
+        raise ValueError(f"params.end is 'horizon', and algorithm is 'dqn'; {NO_HORIZON}")
 
 
 def _check_algorithms(study: Study) -> None:

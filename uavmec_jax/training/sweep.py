@@ -12,7 +12,8 @@ import pandas as pd
 from jaxtyping import PRNGKeyArray
 
 from uavmec_jax.agents.algorithm import Agent, Algorithm
-from uavmec_jax.agents.registry import ALGORITHMS, RegisteredAlgorithm
+from uavmec_jax.agents.registry import ALGORITHMS, NO_HORIZON, RegisteredAlgorithm
+from uavmec_jax.env.layout import check_one_uav
 from uavmec_jax.env.params import leaf_dtype
 from uavmec_jax.env.rollout import Policy
 from uavmec_jax.env.scenario import Scenario
@@ -96,12 +97,14 @@ def train(
         on_progress: called after every chunk.
 
     Raises:
-        StudyError: an unknown algorithm, hyperparameter or setting, a wrong number of values, or too little memory.
+        StudyError: an unknown algorithm, hyperparameter or setting, a wrong number of values, too little memory, several
+            UAVs or depots, or a DQN where episodes go on after a failure.
         AssertionError: the scenarios are not a batch.
     """
     if algorithm not in ALGORITHMS:
         raise StudyError(f"algorithm is {algorithm!r}; {suggest(algorithm, ALGORITHMS)}")
     chex.assert_rank(scenarios.layout.capacity, 2)
+    _check_scenarios(algorithm, scenarios)
     registered, validation = ALGORITHMS[algorithm], validation or Validation()
     n, n_devices = scenarios.layout.capacity.shape
     max_age = int(np.max(scenarios.params.data_age_limit_slots)) + 1
@@ -116,6 +119,16 @@ def train(
     draws = jax.random.split(validation_key, (n, validation.draws))
     shards = train_population(bound, agents, draws, validation=validation, partition=partition, on_progress=on_progress)
     return TrainedPopulation(bound, batched_hyper, _concatenate(list(shards)))
+
+
+def _check_scenarios(algorithm: str, scenarios: Scenario) -> None:
+    """Check that an algorithm can train on scenarios."""
+    try:
+        check_one_uav(scenarios.layout, "training")
+    except ValueError as error:
+        raise StudyError(str(error)) from None
+    if algorithm == "dqn" and scenarios.params.end == "horizon":
+        raise StudyError(f"params.end is 'horizon', and algorithm is 'dqn'; {NO_HORIZON}")
 
 
 def _bind(
