@@ -78,10 +78,14 @@ def test_custom_weights():
 def test_errors_name_what_is_unknown():
     with pytest.raises(ValueError, match="unknown reward 'X'"):
         make_reward("X")
-    with pytest.raises(ValueError, match="unknown reward term 'Q'"):
+    with pytest.raises(
+        ValueError, match="unknown reward term 'Q'; terms are A, U, M, O, log A, log U, log M, log O, S"
+    ):
         make_weights({"Q": 1.0})
     with pytest.raises(ValueError, match="must be a finite number"):
         make_weights({"A": float("nan")})
+    with pytest.raises(ValueError, match="weight of reward term 'S' is nan; it must be a finite number"):
+        make_reward({"S": float("nan")})
     with pytest.raises(ValueError, match="unknown log guard"):
         make_reward("A", "none")
 

@@ -142,3 +142,13 @@ def test_five_values():
     assert done
     assert info["discount"] == 0.0
     assert state.slot == 0
+
+
+def test_fleets_are_refused_and_ages_have_no_limit_until_a_horizon():
+    params = um.Params()
+    layout = um.sample_layout(jax.random.key(0), params, 6, 6)
+    two = make_scenario(layout.replace(fleet=um.env.make_fleet(params, 2)), params)
+    with pytest.raises(ValueError, match="the layout has 2 UAVs and 0 depots; this interface is for one UAV"):
+        UavMecGymEnv(two)
+    space = UavMecGymEnv(make_scenario(layout, params.replace(end="horizon"))).observation_space
+    assert_array_equal(space.high, np.repeat([1.0, np.inf], 12).astype(np.float32))

@@ -6,9 +6,10 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from tests.small_scenarios import three_devices
+from uavmec_jax.env.dynamics import complete_state, initial_state
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Episode
-from uavmec_jax.planning.changes import WhatIf, layouts_to_try, rank_changes
+from uavmec_jax.planning.changes import WhatIf, layouts_to_try, rank_changes, states_to_try
 
 FIRST = Params(n_devices=3)
 HORIZON = Params(n_devices=3, end="horizon", horizon_s=1000.0)
@@ -72,3 +73,15 @@ def test_gains_of_service():
 def test_service_is_a_share_of_the_time_left(seconds):
     ranked = rank_changes(HORIZON, LAYOUT, episodes([5] * 13, [400] * 13), seconds)
     assert_allclose([effect.service for effect in ranked], 400 / seconds)
+
+
+def test_who_repairs_a_dead_device_replaces_its_battery():
+    state = complete_state(LAYOUT, initial_state(HORIZON, LAYOUT))
+    state = state.replace(battery=state.battery.at[0].set(0.0), failed_at=jnp.array([4, -1, -1]))
+    states = states_to_try(LAYOUT, state)
+    assert states.battery.shape == layouts_to_try(HORIZON, LAYOUT).capacity.shape == (13, 3)
+    assert_array_equal(states.failed_at[1], [-1, -1, -1])
+    assert_array_equal(states.battery[1], LAYOUT.capacity)
+    others = np.delete(np.arange(13), 1)
+    assert_array_equal(states.failed_at[others], np.tile([4, -1, -1], (12, 1)))
+    assert_array_equal(states.battery[others], np.tile(state.battery, (12, 1)))

@@ -216,6 +216,7 @@ GULL = "uav 1 (gull): "
         ),
         ({"age_slots": {NAMES[0]: -1}}, f"device 1 ({NAMES[0]}): age_slots is -1; give 0 to 1000000"),
         ({"age_slots": {NAMES[0]: 10**12}}, "age_slots is 1000000000000; give 0 to 1000000"),
+        ({"elapsed_s": 30_000}, "elapsed_s is 30000; the horizon is 21600 s; give less"),
         ({"slot": 10**12}, "slot is 1000000000000; it should be less than or equal to 1000000"),
     ],
 )
@@ -229,7 +230,7 @@ def test_bad_state_is_refused_in_one_line(data, words):
         ({"uav_at": "port", "uavs": [{}]}, "uav_at is given, and uavs too; leave one of them out"),
         ({"uav_at": "b", "uav_position_m": [0, 0]}, "uav_at and uav_position_m are both given; leave one of them out"),
         ({"uav_at": "quay"}, "uav_at is 'quay'; the places are a, b, port, grid"),
-        ({"uav_energy_j": 0}, "uav_energy_j is 0; give more than 0 and at most 1.6e+06"),
+        ({"uav_energy_j": -1}, "uav_energy_j is -1; give from 0 to 1.6e+06"),
         ({"packs": {"port": -1}}, "depot 1 (port): packs is -1; give a whole number from 0"),
         ({"packs": {"grid": 2}}, "depot 2 (grid): packs is 2, but it charges batteries; leave it out"),
         (

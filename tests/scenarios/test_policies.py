@@ -249,3 +249,13 @@ def test_rules_of_fleets_have_names():
     assert load_policy("split-deadline") is FLEET_HEURISTICS["split-deadline"]
     with pytest.raises(PolicyError, match="did you mean 'split-deadline'"):
         load_policy("split-deadlin")
+
+
+def test_a_trained_policy_does_not_visit_dead_devices(ppo_policy):
+    params = um.Params(end="horizon")
+    layout = layout_for_seed(0, params, 4, 4)
+    state = um.initial_state(params, layout)
+    states = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (12, *leaf.shape)), state)
+    dead = ~np.eye(12, dtype=bool)  # all but one
+    states = states.replace(failed_at=jnp.where(dead, 1, -1), battery=jnp.where(dead, 0.0, states.battery))
+    assert_array_equal(ppo_policy(params, layout, states), np.arange(12))

@@ -164,6 +164,10 @@ BAD = [
         {"algorithm": "none", "evaluation.baselines": [], "evaluation.planners": []},
         "bad.toml: algorithm is 'none' and evaluation has neither baselines nor planners; name one to evaluate",
     ),
+    (
+        {"params.end": "horizon", "evaluation.planners": []},
+        "bad.toml: params.end is 'horizon', and algorithm is 'dqn', whose replay holds no ages beyond their limit; give",
+    ),
     ({"evaluation.beam_width": 0}, "bad.toml: evaluation.beam_width is 0; it should be greater than or equal to 1"),
     ({"evaluation.planner_draws": 0}, "bad.toml: evaluation.planner_draws is 0; it should be greater"),
     ({"name": "../x"}, "bad.toml: name is '../x'"),

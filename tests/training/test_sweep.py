@@ -61,3 +61,18 @@ def test_bad_arguments_are_refused(scenarios, changes, message):
 def test_one_scenario_is_not_a_batch(scenarios):
     with pytest.raises(AssertionError, match="rank"):
         um.train("dqn", take(scenarios, 0), key=jax.random.key(0), steps=100)
+
+
+def test_fleets_and_a_dqn_with_a_horizon_are_refused(scenarios):
+    key, n = jax.random.key(0), scenarios.layout.capacity.shape[0]
+    fleet = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), um.env.make_fleet(um.Params(), 2))
+    two = scenarios.replace(layout=scenarios.layout.replace(fleet=fleet))
+    with pytest.raises(
+        um.UserError, match="the layout has 2 UAVs and 0 depots; training is for one UAV without depots"
+    ):
+        um.train("ppo", two, key=key, steps=100)
+    on = scenarios.replace(params=scenarios.params.replace(end="horizon"))
+    with pytest.raises(
+        um.UserError, match="params.end is 'horizon', and algorithm is 'dqn', whose replay holds no ages"
+    ):
+        um.train("dqn", on, key=key, steps=100)

@@ -87,18 +87,22 @@ def for_fleets(rule: Policy) -> Policy:
         state = complete_state(layout, state)
         living, seen = see_living(params, layout, state)
         if is_alone(layout):
-            return rule(with_uav(params, layout, 0), living, seen, key)
+            device = rule(with_uav(params, layout, 0), living, seen, key)
+            return device if params.end == "first_failure" else _present_or_first(living, device)
 
         def choose(uav: Int[Array, ""], served: Bool[Array, " n"], undecided: Bool[Array, " K"]) -> Choice:
             own_key = None if key is None else jax.random.fold_in(key, uav)
             device = rule(*see_as_one(params, living, seen, uav, served), own_key)
-            if living.present is not None:
-                device = jnp.where(living.present[device], device, jnp.argmax(living.present))
-            return Choice(device, jnp.asarray(True))
+            return Choice(_present_or_first(living, device), jnp.asarray(True))
 
         return in_turn(params, layout, state, plan_returns(params, layout, state), choose)
 
     return policy
+
+
+def _present_or_first(layout: Layout, device: Int[Array, ""]) -> Int[Array, ""]:
+    """Return the device, or in place of padding the first that is none."""
+    return device if layout.present is None else jnp.where(layout.present[device], device, jnp.argmax(layout.present))
 
 
 def see_living(params: Params, layout: Layout, state: State) -> tuple[Layout, State]:

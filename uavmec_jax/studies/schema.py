@@ -224,7 +224,7 @@ def _check_horizon(study: Study) -> None:
             "planners = ['rollout'] or []"
         )
     if study.params.end == "horizon" and "dqn" in study.algorithms:
-        raise ValueError(f"params.end is 'horizon', and algorithm is 'dqn'; {NO_HORIZON}")
+        raise ValueError(f"params.end is 'horizon', and algorithm is 'dqn', {NO_HORIZON}")
 
 
 def _check_algorithms(study: Study) -> None:

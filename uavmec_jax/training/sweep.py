@@ -128,7 +128,7 @@ def _check_scenarios(algorithm: str, scenarios: Scenario) -> None:
     except ValueError as error:
         raise StudyError(str(error)) from None
     if algorithm == "dqn" and scenarios.params.end == "horizon":
-        raise StudyError(f"params.end is 'horizon', and algorithm is 'dqn'; {NO_HORIZON}")
+        raise StudyError(f"params.end is 'horizon', and algorithm is 'dqn', {NO_HORIZON}")
 
 
 def _bind(
