@@ -38,7 +38,7 @@ def apply_network(weights, params, layout, state):
 
 
 def pad_state(state, entries):
-    """The state with entries behind it that are not devices."""
+    """The state with entries after it that are not devices."""
     battery = jnp.pad(state.battery, (0, entries), constant_values=1.0)
     return state.replace(battery=battery, age=jnp.pad(state.age, (0, entries)))
 

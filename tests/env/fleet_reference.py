@@ -199,7 +199,7 @@ def reference_slot(params, layout, state, action, volumes):
     flights = [math.dist(one.position, spot) / one.speed for one, spot in zip(vehicles, spots, strict=True)]
     willing = [v for v, one in enumerate(vehicles) if not one.grounded]
 
-    # Who starts: first their own flights, then the whole slot, until all that are left can pay.
+    # Which UAVs start: first their own flights, then the whole slot, until all that are left can pay.
     flying = [v for v in willing if edge.at_least(vehicles[v].energy, vehicles[v].flying * flights[v])]
     while True:
         plan = plan_slot(params, layout, vehicles, places, spots, flights, flying, living, volumes, edge)

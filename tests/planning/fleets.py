@@ -36,11 +36,11 @@ def town(
         uavs: number of UAVs, of which the last ones are padding if fewer are ``flying``.
         flying: UAVs that are not padding.
         devices: number of devices.
-        padding: entries of the layout behind them.
+        padding: entries of the layout after them.
         depots: see :func:`make_depots`; ``None`` for none.
         powered, connected: numbers of devices.
         unequal: whether UAVs differ in all that they can differ in.
-        more_depots: padding behind the depots.
+        more_depots: padding after the depots.
         changes: of the parameters.
     """
     rng = np.random.default_rng(seed)
@@ -62,7 +62,7 @@ def town(
 
 
 def with_padding(depots, number):
-    """Return the depots with ``number`` entries behind them that are padding."""
+    """Return the depots with ``number`` entries after them that are padding."""
     far = make_depots([[1e6, 1e6]] * number)
     far = far.replace(pads=jnp.zeros(number), packs=jnp.zeros(number))
     return jax.tree.map(lambda real, padding: jnp.concatenate([real, padding]), depots, far)

@@ -261,7 +261,7 @@ BAD = {
     ),
     "hop": (
         FAR + UAV + "battery_j = 10.0" + UAV + 'name = "u"\nbattery_j = 12_000.0',
-        "the hop from b to a is 699 m long; u, which flies furthest on a full battery, comes 400 m: give it more battery_j",
+        "the hop from b to a is 699 m long; u, which flies furthest on a full battery, can fly at most 400 m; give it more",
     ),
     "hop to a depot": (
         "[params]\nuav_battery_j = 12_000.0" + DEPOT.replace("x_m = 9.0", "x_m = 700.0") + DEVICE,

@@ -232,7 +232,11 @@ def test_bad_state_is_refused_in_one_line(data, words):
         ({"uav_at": "quay"}, "uav_at is 'quay'; the places are a, b, port, grid"),
         ({"uav_energy_j": -1}, "uav_energy_j is -1; give from 0 to 1.6e+06"),
         ({"packs": {"port": -1}}, "depot 1 (port): packs is -1; give a whole number from 0"),
-        ({"packs": {"grid": 2}}, "depot 2 (grid): packs is 2, but it charges batteries; leave it out"),
+        (
+            {"packs": {"grid": 2}},
+            "depot 2 (grid): packs is 2, but it charges batteries; give packs by name, without this depot",
+        ),
+        ({"packs": [1, 0]}, "depot 2 (grid): packs is 0, but it charges batteries; give packs by name, without this"),
         (
             {"failed_at": {"a": 0}},
             "failed_at is given, but the first failure ends the episode; leave it out, or give par",

@@ -203,7 +203,7 @@ def test_drawn_scenarios_have_one_uav():
         StudyError, match=r"^x: uavs is 2, and scenarios are given, which have one UAV; leave one of them"
     ):
         parse_study(drawn, "x")
-    with pytest.raises(StudyError, match=r"^x: evaluation.clairvoyant_seeds is given, and scenarios too"):
+    with pytest.raises(StudyError, match=r"^x: evaluation.clairvoyant_seeds is given, but with \[scenarios\]"):
         parse_study(drawn, "x", {"uavs": 1, "evaluation.clairvoyant_seeds": [1]})
 
 

@@ -71,7 +71,7 @@ class Outcome:
     Attributes:
         cause: why the episode ended with this slot, a :class:`Cause` as int32.
         failed: devices that failed in this slot: their battery ran out or their data expired.
-        served: devices within range of a UAV that hovers.
+        served: living devices that upload in this slot: in range of a hovering UAV, or its target.
         duration: length of the slot, s; 0 if it never started.
         first_failure: each device's share in the first failure. Shares sum to 1 if a device failed: the battery that
             runs out earliest inside the slot has all of it; devices whose data expired share it equally.

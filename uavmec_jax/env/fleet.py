@@ -72,7 +72,7 @@ class Depots:
 
 
 UAV_FIELDS = ("speed_m_s", "flying_power_w", "hovering_power_w", "battery_j", "signal_range_m")
-"""Fields of a :class:`Fleet` whose defaults are the parameters of the same name behind ``uav_``."""
+"""Fields of a :class:`Fleet` whose defaults are the parameters of the same name prefixed with ``uav_``."""
 
 
 _Range = tuple[str, Callable[[float], bool]]

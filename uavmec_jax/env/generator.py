@@ -118,7 +118,7 @@ def _draw_layout(
     n_powered: Num[Array, ""],
     n_connected: Num[Array, ""],
 ) -> Layout:
-    """Draw ``count`` devices as :func:`sample_layout` does, but with varied hardware, and padding behind them."""
+    """Draw ``count`` devices as :func:`sample_layout` does, but with varied hardware, and padding after them."""
     size = params.n_devices
     u = jax.random.uniform(key, (size, 10))
     present = jnp.arange(size) < count

@@ -30,7 +30,7 @@ class ServiceMeasures:
             device with communication have the age 0.
         age_95: slots; in 95 % of those device-slots, the data were not older.
         flights: takeoffs of all UAVs: slots in which a UAV flew to another place.
-        energy_used_j: J that the UAVs used, what depots gave them included.
+        energy_used_j: J that the UAVs used, from their own batteries and from depots.
         packs_used: batteries that depots swapped.
     """
 
@@ -88,7 +88,7 @@ def measure(
 
 
 def seconds_until_horizon(params: Params, trace: Trace) -> Float[Array, " H"]:
-    """Return how long each slot of an episode lasts, s; what is behind the horizon, if there is one, does not count."""
+    """Return how long each slot of an episode lasts, s; what is beyond the horizon, if there is one, does not count."""
     duration = trace.outcome.duration
     if params.end != "horizon":
         return duration
@@ -97,7 +97,7 @@ def seconds_until_horizon(params: Params, trace: Trace) -> Float[Array, " H"]:
 
 
 def _ages(age: Int[Array, "H n"], counts: Float[Array, "H n"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return the mean and the 95th percentile (nearest rank) of ages that count differently much; NaN if none does."""
+    """Return the mean and the 95th percentile (nearest rank) of ages weighted by ``counts``; NaN if all weights are 0."""
     total = jnp.sum(counts)
     order = jnp.argsort(age, axis=None)
     reaches = jnp.cumsum(counts.reshape(-1)[order]) >= _HIGH_SHARE * total * (1.0 - 1e-5)

@@ -34,6 +34,7 @@ class Params:
     uav_altitude_m: Scalar = 10.0
     uav_battery_j: Scalar = struct.field(default=1_600_000.0, metadata={"gt": 0})
     n_devices: int = struct.field(pytree_node=False, default=12, metadata={"ge": 2, "le": MAX_DEVICES})
+    """Number of devices; as a setting at least 2. A scenario file, whose devices are counted, may hold a single one."""
     bandwidth_hz: Scalar = struct.field(default=20e6, metadata={"gt": 0})
     noise_power_dbm: Scalar = struct.field(default=-100.0, metadata={"ge": -300, "le": 300})
     reference_gain_db_at_1m: Scalar = struct.field(default=-50.0, metadata={"ge": -300, "le": 300})

@@ -59,7 +59,7 @@ def rollout(policy: Policy, params: Params, layout: Layout, key: PRNGKeyArray) -
     """Play one episode.
 
     Args:
-        policy: chooses the device to visit in each slot.
+        policy: chooses each UAV's place in each slot.
         params: simulation parameters.
         layout: the devices.
         key: draws the task volumes: two policies with the same key have the same volumes, slot by slot. The policy's
@@ -69,7 +69,7 @@ def rollout(policy: Policy, params: Params, layout: Layout, key: PRNGKeyArray) -
 
 
 def rollout_from(policy: Policy, params: Params, layout: Layout, state: State, key: PRNGKeyArray) -> Episode:
-    """Play an episode as :func:`rollout` does, but from any state in which no device has failed."""
+    """Play an episode as :func:`rollout` does, but from any state in which the episode has not ended."""
     return _play(policy, params, layout, state, key, slots=0)[1]
 
 
@@ -130,7 +130,7 @@ def _play(
 
 
 def _is_running(params: Params, state: State, outcome: Outcome) -> Bool[Array, ""]:
-    """Return whether the episode continues after a slot: nothing has failed, and the time limit is not reached."""
+    """Return whether the episode continues after a slot: nothing has ended it, and the time limit is not reached."""
     return (outcome.cause == Cause.NONE) & (state.slot < params.max_slots)
 
 
@@ -245,7 +245,7 @@ def rollout_draws(policy: Policy, scenario: Scenario | ScenarioDistribution, key
     """Play one episode per key; the result's leaves are ``[D, ...]``.
 
     Args:
-        policy: chooses the device to visit in each slot.
+        policy: chooses each UAV's place in each slot.
         scenario: a scenario, or a distribution from which every key draws its own scenario.
         keys: draw the task volumes, and the scenarios if there is a distribution.
     """

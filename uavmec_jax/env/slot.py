@@ -1,4 +1,4 @@
-"""One slot's flights and services: who starts, who serves which device, how long the slot lasts, what it costs."""
+"""One slot's flights and services: which UAVs start and which devices they serve, how long the slot lasts, what it costs."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -45,7 +45,7 @@ class Services(NamedTuple):
 
     Attributes:
         served: which devices are served.
-        t_upload: s, upload time of each served device, to the UAV with which it is through first.
+        t_upload: s, upload time of each served device, to the UAV at which its upload finishes first.
         duration: s, length of the slot.
         cost: J, what the slot costs each UAV that starts.
     """
@@ -95,7 +95,7 @@ def services_of(
         fleet: the UAVs.
         flights: see :func:`plan_flights`.
         living: devices that work; ``None`` if all do.
-        started: UAVs that start; ``None`` for the only one of a scenario without depots, without which there is no slot.
+        started: UAVs that start. ``None``: the only UAV of a scenario without depots; if it does not start, there is no slot.
     """
     covers = flights.covers if started is None else flights.covers & started[:, None]
     covers = covers if living is None else covers & living
@@ -119,7 +119,7 @@ def services_of(
 
 
 def _of_first(through: Float[Array, "K n"], value: Float[Array, "K n"]) -> Float[Array, " n"]:
-    """Return each device's value at the UAV with which it is through first, the lowest one of several."""
+    """Return each device's value at the UAV at which its upload finishes first, the lowest one of several."""
     if through.shape[0] == 1:
         return value[0]
     is_first = jnp.argmin(through, axis=0) == jnp.arange(through.shape[0])[:, None]
@@ -133,10 +133,10 @@ def who_starts(
     able: Bool[Array, " K"],
     services: Callable[[Bool[Array, " K"]], Services],
 ) -> Bool[Array, " K"]:
-    """Return the UAVs that start: whoever can pay for its flight, and then for the slot that those left over make.
+    """Return the UAVs that start: those that can pay for their own flight and then for the slot that results.
 
-    Those that cannot pay for a slot are taken out together, which changes the slot for the others; then it is computed
-    again, until nobody is taken out.
+    Those that cannot pay for a slot are left out together, which changes the slot for the others; then it is computed
+    again, until all the others can pay.
     """
 
     def can_pay(started: Bool[Array, " K"]) -> Bool[Array, " K"]:

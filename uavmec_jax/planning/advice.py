@@ -34,7 +34,7 @@ class Candidate:
     """One place as the next target.
 
     Attributes:
-        place: index of the place from 0: a device, or behind the devices a depot.
+        place: index of the place from 0: a device, or after the devices a depot.
         lifetime: slots, mean over the futures if the UAV flies there next and the policy decides from then on.
         behind: slots by which the best candidate's value exceeds this one's on the same futures. The value of a future is
             its lifetime minus the price of its first failure, if the layout's traffic has prices; for fleets, the last slot
@@ -54,13 +54,13 @@ class Candidate:
 
 @dataclass(frozen=True)
 class UavAdvice:
-    """What one UAV should do next, the UAVs before it having decided already and those behind it doing what the policy says.
+    """What one UAV should do next, the UAVs before it having decided already and those after it doing what the policy says.
 
     Attributes:
         candidates: every place, the best first.
         policy_choice: index of the place that the policy itself would send it to.
         returns_in: slots until it flies to a depot, this one counting 0, median over futures in which it follows the policy
-            from the next slot on; NaN if in most of them it never does.
+            from the next slot on; NaN if in half or more of them it never does.
         returns_in_s: s until the slot in which it does, likewise.
     """
 

@@ -9,9 +9,10 @@ The search tries to reach a *target* lifetime. Slot by slot, it tries the action
    or the UAV's energy does not last;
 2. the states that another state with the UAVs in the same places dominates: no older data, no less battery or UAV energy;
 3. all but the ``width`` states with the highest score, which is that of the states from which the devices need the fewest
-   visits to reach the target.
+   visits to reach the target;
+4. for fleets, whose actions are decided one UAV at a time, all but the partly decided actions with the highest scores.
 
-The first target is an upper bound on the lifetime; it is lowered by one slot until a tour reaches it. Only rule 3 is
+The first target is an upper bound on the lifetime; it is lowered by one slot until a tour reaches it. Rules 3 and 4 are
 heuristic, the other two prune with a proof, so a beam that is wide enough finds the optimum. (In a fleet with hardware whose
 uploads take longer than computing, rule 2 is heuristic as well.)
 """

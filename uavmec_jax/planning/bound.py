@@ -1,8 +1,8 @@
 """A certified upper bound: the lifetime that no policy exceeds on one layout with one volume draw.
 
 A lifetime of k slots requires that every device survives k - 1 slots. Without depots it also requires that a UAV hovers in
-all k slots: all that have not been grounded hover in every slot, and who does not start is grounded. With depots nobody has
-to: a UAV that has landed starts into the next slot for nothing, even where there is nothing left to get.
+all k slots: all that have not been grounded hover in every slot, and a UAV that does not start is grounded. With depots none
+has to hover: a UAV that has landed starts into the next slot for nothing, even where there is nothing left to get.
 
 Both requirements are relaxed to a linear program over ``x[t, c]``, the share of slot t in which the fleet uses the hover set
 c (:mod:`uavmec_jax.planning.hover_sets`)::
@@ -13,7 +13,7 @@ It is refuted with a certificate (:mod:`uavmec_jax.planning.refutation`). If k s
 and the bound is found by bisection. What a policy does in a slot corresponds to the set of the points above which UAVs hover,
 and it satisfies every row:
 
-- *Devices.* Whoever is served is in the set's range. A slot is as long as its slowest device; flights only lengthen it, and
+- *Devices.* A served device is in the set's range. A slot is as long as its slowest device; flights only lengthen it, and
   an upload is as short as to the best point of the set. A battery spends its standby power for that long, and the work or
   at least an upload from right below the UAV (:func:`uavmec_jax.planning.device_rows.add_battery_rows`, which also counts
   whole visits). Data that do not expire are collected in every window of ``slots_to_expiry`` slots.

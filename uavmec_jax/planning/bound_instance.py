@@ -83,7 +83,7 @@ class Instance:
 
     @property
     def may_decline(self) -> bool:
-        """Whether a device in range of a hover set takes part in the slot as it likes, served or not."""
+        """Whether a device in range of a hover set counts as served or not served, whichever helps the network."""
         return self.ranges_differ or not self.is_listed
 
 

@@ -51,7 +51,7 @@ def add_age_rows(rows: Rows, instance: Instance, survive: int) -> None:
 def _hardest(devices: Int[np.ndarray, " d"], covers: Bool[np.ndarray, "q n"]) -> list[int]:
     """Return the devices without those that are served whenever another one is; of equal ones the first."""
     columns = covers[:, devices]
-    # with_other[i, j]: whoever serves i serves j.
+    # with_other[i, j]: every hover point that serves i serves j.
     with_other = ~np.any(columns[:, :, None] & ~columns[:, None], axis=0)
     earlier = np.tri(len(devices), k=-1, dtype=bool).T
     implied = np.any(with_other & (earlier | ~with_other.T), axis=0)

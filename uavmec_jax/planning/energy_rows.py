@@ -115,7 +115,7 @@ def _refills(
 
 
 def _longest_slots(instance: Instance, depots: Depots) -> Float[np.ndarray, " H"]:
-    """Return the length in s that no slot exceeds: nobody is served, or somebody after the longest flight."""
+    """Return the length in s that no slot exceeds: no device is served, or one is after the longest flight."""
     points = np.concatenate([instance.position[instance.hover_points], depots.position, instance.start])
     longest = np.linalg.norm(points[:, None] - points[None], axis=-1).max() / instance.speed
     flying = instance.flying_power

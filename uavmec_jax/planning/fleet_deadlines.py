@@ -2,8 +2,9 @@
 
 As for one UAV (:mod:`uavmec_jax.planning.deadlines`), data are collected by their deadlines and batteries are served in what
 is left. What is new with ``m`` UAVs in the air: ``m`` visits fit into a slot, but a device gains nothing from two of them.
-Batteries are therefore served by least laxity: the one that needs the most services before the end comes first, which
-loses no service as long as any order does not (McNaughton 1959).
+Batteries are therefore served by least laxity. With a common deadline this means that the battery needing the most services
+comes first (Hu's level rule, T. C. Hu, Operations Research 9, 1961). A schedule with all services exists if no battery needs
+more of them than there are slots, and all together no more than ``m`` per slot (McNaughton 1959).
 """
 
 from dataclasses import replace

@@ -1,6 +1,7 @@
 """Heuristic policies: the baselines that every table shows beside the learned policies.
 
-Each has the signature of a policy, ``policy(params, layout, state, key=None) -> action`` with an int32 in ``[0, n)``.
+Each has the signature of a policy, ``policy(params, layout, state, key=None) -> action`` with an int32, a place in
+``[0, n + D)``, one per UAV.
 """
 
 from collections.abc import Callable, Mapping

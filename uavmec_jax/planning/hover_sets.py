@@ -1,8 +1,8 @@
 """The hover sets of a fleet: where its UAVs hover in a slot, which devices they serve, and how long the slot is at least.
 
 A *hover set* is a set of at most K hover points, with a UAV above each. UAVs that share a hover point count once, those that
-have landed or are grounded not at all; the empty set occurs only if there are depots. If the UAVs' signal ranges differ, the
-largest one counts, and a device in range takes part in the slot as it likes, served or not.
+have landed or are grounded not at all; the empty set occurs only if there are depots. If the signal ranges differ, the
+largest is used for all, and the bound counts a device in range as served or not served, whichever helps the network.
 """
 
 from abc import ABC, abstractmethod
@@ -73,7 +73,7 @@ class ListedHoverSets(HoverSets):
         t_work: s, time that a device works in each of ``H`` slots if it is not served.
         bits: size of each device's task.
         may_be_empty: whether a slot may start without a UAV that hovers.
-        may_decline: whether a device in range need not be served.
+        may_decline: whether a device in range counts as served or not served, whichever helps the network.
     """
 
     def __init__(

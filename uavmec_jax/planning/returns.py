@@ -27,7 +27,7 @@ _MARGIN = 1e-4
 
 
 class Returns(NamedTuple):
-    """Who returns to which depot.
+    """Which UAVs return, and to which depots.
 
     Attributes:
         distance: m, from each UAV to each depot that can help and that its energy reaches; infinite to the others.
@@ -55,7 +55,7 @@ class Returns(NamedTuple):
 
 
 def plan_returns(params: Params, layout: Layout, state: State, slots_to_go: ArrayLike = jnp.inf) -> Returns | None:
-    """Return who returns to a depot in this slot; ``None`` without depots.
+    """Return which UAVs return to a depot in this slot; ``None`` without depots.
 
     A UAV whose energy lasts for ``slots_to_go`` slots, that is, to the end, does not have to.
     """

@@ -15,7 +15,7 @@ def service_bound(params: Params, layout: Layout) -> Float[Array, ""]:
 
     A device without power that is in service after a slot has a battery that is not empty then. In every slot up to there it
     has drawn its standby power for the whole slot, and for its work or its upload no less than nothing. So the slots in
-    which it is in service take less than ``capacity / standby_power`` together, whoever flies where, and never more than the
+    which it is in service take less than ``capacity / standby_power`` together, whatever the UAVs do, and never more than the
     time to the horizon. The share is the mean over the devices, weighted as in :func:`uavmec_jax.env.dynamics.service`.
 
     Args:

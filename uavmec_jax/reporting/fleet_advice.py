@@ -148,6 +148,6 @@ def _return(uav: UavAdvice, action: str) -> str:
     if uav.returns_in == 0:
         return ""
     if math.isnan(uav.returns_in):
-        return "; it need not return to a depot"
+        return "; no return to a depot within 128 slots in most futures"
     slots = f"{uav.returns_in:g} slot{'s' * (uav.returns_in != 1)}"
     return f"; it returns to a depot in {duration(uav.returns_in_s)} ({slots})"

@@ -80,8 +80,8 @@ def _uav_row(
 def fleet_table(rows: Sequence[dict[str, Any]], scenario: NamedScenario) -> Table:
     """Return a table of the slots of a tour; slots in which no UAV flies and nothing else changes share a row.
 
-    Places have their numbers: ``#1`` for a device, ``D1`` for a depot. Behind them is the energy that is left, in kJ; after a
-    swap the battery is full. Devices whose battery is empty are in a column of their own, if there are any.
+    Places have their numbers: ``#1`` for a device, ``D1`` for a depot. After the place comes the energy left in the UAV, in
+    kJ; after a swap the battery is full. Devices whose battery is empty are in a column of their own, if there are any.
 
     Args:
         rows: from :func:`fleet_rows`.

@@ -53,7 +53,8 @@ def _check_fleet(file: ScenarioFile, fleet: Fleet, positions: Positions) -> None
         here, there, metres = hop
         raise ValueError(
             f"the hop from {names[here]} to {names[there]} is {metres:,.0f} m long; {file.uav_names[furthest]}, which flies "
-            f"furthest on a full battery, comes {reach[furthest]:,.0f} m: give it more battery_j"
+            f"furthest on a full battery, can fly at most {reach[furthest]:,.0f} m; give it more battery_j or "
+            "move the places closer"
         )
     distance = np.hypot(*np.moveaxis(positions.starts[:, None] - places, -1, 0))
     nearest, metres = np.argmin(distance, axis=1), np.min(distance, axis=1)

@@ -168,7 +168,7 @@ def depot_packs(packs: Any, scenario: NamedScenario) -> Float[np.ndarray, " D"]:
     for number, (name, has, had, kind) in enumerate(zip(names, left, stock, np.asarray(depots.kind), strict=True), 1):
         where = f"{label('depot', number, name)}: packs is {has:g}"
         if kind == DepotKind.CHARGE and has != np.inf:
-            raise ValueError(f"{where}, but it charges batteries; leave it out")
+            raise ValueError(f"{where}, but it charges batteries; give packs by name, without this depot")
         if not 0 <= has <= had or (has != np.floor(has)):
             at_most = "" if had == np.inf else f" to {had:g}, its stock at the start"
             raise ValueError(f"{where}; give a whole number from 0{at_most}")

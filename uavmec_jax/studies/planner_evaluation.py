@@ -32,7 +32,7 @@ def evaluate_planners(
         agents: leaves ``[A, ...]``.
         keys: held-out draws.
         settings: which planners, on how many draws, and how wide they search.
-        lifetimes: lifetimes of policies on these draws and any more behind them; the bound cannot be below them.
+        lifetimes: lifetimes of policies on these draws and any more after them; the bound cannot be below them.
         clairvoyant: agents that beam and bound are evaluated for; ``None``: all.
     """
     draws = min(settings.planner_draws, keys.shape[1])

@@ -193,7 +193,7 @@ def _check_fleets(study: Study) -> None:
         raise ValueError("evaluation.clairvoyant_seeds is empty; give a number for one UAV, for two, and so on")
     if study.evaluation.clairvoyant_seeds is not None and study.scenarios is not None:
         raise ValueError(
-            "evaluation.clairvoyant_seeds is given, and scenarios too, whose seeds share them; leave it out"
+            "evaluation.clairvoyant_seeds is given, but with [scenarios] all seeds share the held-out scenarios; leave it out"
         )
     check_depots(study.depot)
     if not (study.place or "place" in study.axes):
