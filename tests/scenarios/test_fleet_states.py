@@ -138,7 +138,7 @@ def test_any_state_is_read_back_to_the_bit(data):
         ),
         uav_energy=jnp.array(capacity * np.array(draw(unit, uavs), np.float32)),
         slot=jnp.int32(slot),
-        elapsed=jnp.float32(data.draw(unit) * 43_200),
+        elapsed=jnp.float32(data.draw(unit) * 21_000),
         grounded=jnp.array(draw(st.booleans(), uavs)),
         failed_at=jnp.where(failed, jnp.array(draw(st.integers(0, slot), n)), -1),
         packs=jnp.array(

@@ -248,7 +248,7 @@ def test_beam_and_bound_are_evaluated_for_some_agents_only(study, monkeypatch):
 
     monkeypatch.setattr(planner_evaluation, "beam_episodes", beam)
     monkeypatch.setattr(planner_evaluation, "bound_scenarios", bound)
-    monkeypatch.setattr(planner_evaluation, "horizon", lambda *_: 64)
+    monkeypatch.setattr(planner_evaluation, "planned_slots", lambda *_: 64)
     settings = Evaluation(planners=("beam", "bound"), planner_draws=2)
     agents, keys = make_agents(part), evaluation_keys(part)[:, :-1]
     chosen = np.array([agent_id["seed"] == 0 for agent_id in make_agent_ids(part)])

@@ -1,6 +1,7 @@
 """``um.train``: training from a script."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -73,6 +74,6 @@ def test_fleets_and_a_dqn_with_a_horizon_are_refused(scenarios):
         um.train("ppo", two, key=key, steps=100)
     on = scenarios.replace(params=scenarios.params.replace(end="horizon"))
     with pytest.raises(
-        um.UserError, match="params.end is 'horizon', and algorithm is 'dqn', whose replay holds no ages"
+        um.UserError, match=r"params\.end is 'horizon', and algorithm is 'dqn', whose replay holds no ages"
     ):
         um.train("dqn", on, key=key, steps=100)
