@@ -1,0 +1,53 @@
+"""Rules, rollout planner and beam for fleets against the optimum of small instances, found by exhaustive search."""
+
+from functools import partial
+
+import jax
+import numpy as np
+import pytest
+
+from tests.planning.fleet_instances import solved_instance
+from uavmec_jax.env.rollout import rollout, tour_policy
+from uavmec_jax.planning.beam import beam_search
+from uavmec_jax.planning.heuristics import FLEET_HEURISTICS
+from uavmec_jax.planning.rollout_planner import rollout_planner
+
+POLICIES = {**FLEET_HEURISTICS, "rollout planner": rollout_planner(samples=2)}
+
+search = jax.jit(beam_search, static_argnames="width")
+
+
+@partial(jax.jit, static_argnames="name")
+def lifetime_of(name, params, layout, key):
+    return rollout(POLICIES[name], params, layout, key).length
+
+
+def check(seed):
+    """Check that nothing beats the optimum and that a wide beam reaches it; return the optimum and the best of the others."""
+    params, layout, key, volumes, optimum = solved_instance(seed)
+    best = int(optimum.lifetime)
+    lifetimes = {name: int(lifetime_of(name, params, layout, key)) for name in POLICIES}
+    beams = {width: search(params, layout, volumes, width=width) for width in (1, 16, 2048)}
+    lifetimes |= {f"beam {width}": int(tour.lifetime) for width, tour in beams.items()}
+    assert max(lifetimes.values()) <= best, (seed, lifetimes)
+    assert beams[2048].lifetime == best, (seed, lifetimes)
+    assert beams[2048].bound >= best, seed
+    for width, tour in beams.items():
+        assert rollout(tour_policy(tour.actions), params, layout, key).length == tour.lifetime, (seed, width)
+    return best, lifetimes
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first_seed", range(0, 60, 20))
+def test_no_policy_beats_the_optimum_and_a_wide_beam_reaches_it(first_seed):
+    seeds = [seed for seed in range(first_seed, first_seed + 20) if solved_instance(seed) is not None]
+    assert len(seeds) >= 12
+    shares = {}
+    for seed in seeds:
+        best, lifetimes = check(seed)
+        for name, lifetime in lifetimes.items():
+            shares.setdefault(name, []).append(lifetime / best)
+    assert np.mean(shares["rollout planner"]) >= 0.95
+    assert np.mean(shares["beam 16"]) >= 0.97
+    assert np.mean(shares["earliest-deadline"]) >= 0.9
+    assert np.mean(shares["stay-put"]) < 0.95
