@@ -63,7 +63,8 @@ def test_nothing_is_started_after_a_stop():
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT], ids=lambda how: how.name)
 def test_nothing_is_left_behind_when_killed(tmp_path, how):
     code = f"""
-import sys
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell makes its background processes ignore
 from pathlib import Path
 from uavmec_jax.traffic.workspace import Workspace
 sleeper = "import os, time; open('pid', 'w').write(str(os.getpid())); os.rename('pid', '{tmp_path}/pid'); time.sleep(600)"
