@@ -34,6 +34,11 @@ def censored_share(share: float) -> str:
     return f" ({share:.0%} censored)" if share > 0 else ""
 
 
+def at_least(cell: Any, policy: str) -> str:
+    """Return the sign in front of a mean lifetime that is only known to be no shorter: some of the episodes are censored."""
+    return "≥" if cell.get(f"{policy}_censored", 0.0) > 0 else ""
+
+
 def cell_name(cell: Any, axes: Iterable[str]) -> str:
     """Format the values of a cell as its name: ``8/6`` for the counts of devices, and the other axes by name."""
     counts, others = [], []

@@ -8,6 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from uavmec_jax.reporting.formatting import (
+    at_least,
     axis_values,
     censored,
     column_name,
@@ -99,6 +100,8 @@ def step_name(upper: str, lower: str) -> str:
 def gap_title(results: Results) -> str:
     """Return the title of :func:`gap_table`: it names the lines of a cell."""
     steps = "; ".join(step_name(*step) for step in results.gaps)
+    if any(f"{upper}_censored" in results.agents for upper, _ in results.gaps):
+        steps += "; *: of the longer lifetimes, some are censored"
     return f"Gaps up to the upper bound, % (same layouts and volumes): {steps}"
 
 
@@ -106,10 +109,8 @@ def gap_table(results: Results, cells: pd.DataFrame) -> Table:
     """Return a grid of the steps from the shown policy up to the bound, each in percent of the lower lifetime."""
 
     def steps(cell: Any) -> Text:
-        gaps = gap_percent(results, cell).values()
-        return Text(
-            "\n".join(percent(gap) + censored(cell, upper) for gap, (upper, _) in zip(gaps, results.gaps, strict=True))
-        )
+        gaps = zip(results.gaps, gap_percent(results, cell).values(), strict=True)
+        return Text("\n".join(percent(gap) + "*" * bool(at_least(cell, upper)) for (upper, _), gap in gaps))
 
     return _grid(cells, steps)
 
@@ -144,11 +145,12 @@ def _is_papers_fleet(results: Results) -> bool:
 
 def _lifetime(cell: Any, policy: str, baselines: list[str], with_paper: bool) -> Text:
     paper = TABLE5.get((cell["powered"], cell["connected"])) if with_paper else None
-    text = Text(f"{cell[policy]:.1f}", style=_style(cell[policy], paper))
-    text.append(half_interval(cell[f"{policy}_low"], cell[f"{policy}_high"]) + censored(cell, policy), style="dim")
+    text = Text(f"{at_least(cell, policy)}{cell[policy]:.1f}", style=_style(cell[policy], paper))
+    text.append(half_interval(cell[f"{policy}_low"], cell[f"{policy}_high"]), style="dim")
     compared = [f"{paper:g}" if paper is not None else "-"] * with_paper
-    compared += [f"{cell[baseline]:.1f}{censored(cell, baseline)}" for baseline in baselines]
-    return text.append(f"\n{' / '.join(compared)}" if compared else "", style="not bold default")
+    compared += [f"{at_least(cell, baseline)}{cell[baseline]:.1f}" for baseline in baselines]
+    separator = "\n" if f"{policy}_censored" in cell else " / "  # signs take room
+    return text.append(f"\n{separator.join(compared)}" if compared else "", style="not bold default")
 
 
 def _style(ours: float, paper: float | None) -> str:
@@ -191,7 +193,7 @@ def _grid(cells: pd.DataFrame, content: Callable[[Any], Text]) -> Table:
     """A table of powered x connected devices with a text for each cell; empty where an interrupted run has none."""
     table = Table()
     connected = list(dict.fromkeys(cells["connected"]))
-    table.add_column("power\n\\ comms", justify="right", style="bold")
+    table.add_column("power\n\\ comms", justify="right", style="bold", no_wrap=True)
     for count in connected:
         table.add_column(str(count), justify="right", no_wrap=True)
     for powered in dict.fromkeys(cells["powered"]):
