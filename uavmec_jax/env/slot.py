@@ -66,7 +66,9 @@ def plan_flights(
 ) -> Flights:
     """Return the flights to the UAVs' targets, places in ``[0, n + D)``, and the services that they would bring."""
     n = layout.n_devices
-    place = layout.places()[target]
+    place = (
+        layout.places()[target[0]][None] if target.shape[0] == 1 else layout.places()[target]
+    )  # one is a cheap slice
     hovers = target < n if layout.n_depots else jnp.ones(target.shape, bool)
     ground = layout.position - place[:, None]
     slant = jnp.sqrt(jnp.sum(ground**2, axis=-1) + params.uav_altitude_m**2)
@@ -100,7 +102,9 @@ def services_of(
     covers = flights.covers if started is None else flights.covers & started[:, None]
     covers = covers if living is None else covers & living
     served = jnp.any(covers, axis=0)
-    through = jnp.where(covers, flights.t_fly[:, None] + flights.t_upload, jnp.inf)
+    through = flights.t_fly[:, None] + flights.t_upload
+    if covers.shape[0] > 1:  # (with one UAV, only what is served counts)
+        through = jnp.where(covers, through, jnp.inf)
     busy = jnp.where(served, jnp.min(through, axis=0), flights.t_work)
     duration = jnp.max(busy if living is None else jnp.where(living, busy, -jnp.inf))
     if started is not None:  # (alone, a UAV serves its target, which takes longer than the flight)
