@@ -38,16 +38,16 @@ def check(seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first_seed", range(0, 60, 20))
+@pytest.mark.parametrize("first_seed", [0, 15])
 def test_no_policy_beats_the_optimum_and_a_wide_beam_reaches_it(first_seed):
-    seeds = [seed for seed in range(first_seed, first_seed + 20) if solved_instance(seed) is not None]
-    assert len(seeds) >= 12
+    seeds = [seed for seed in range(first_seed, first_seed + 15) if solved_instance(seed) is not None]
+    assert len(seeds) >= 10
     shares = {}
     for seed in seeds:
         best, lifetimes = check(seed)
         for name, lifetime in lifetimes.items():
             shares.setdefault(name, []).append(lifetime / best)
-    assert np.mean(shares["rollout planner"]) >= 0.95
-    assert np.mean(shares["beam 16"]) >= 0.97
-    assert np.mean(shares["earliest-deadline"]) >= 0.9
-    assert np.mean(shares["stay-put"]) < 0.95
+    mean = {name: float(np.mean(of)) for name, of in shares.items()}
+    assert mean["beam 16"] >= 0.98, mean
+    assert mean["rollout planner"] >= 0.85, mean
+    assert mean["stay-put"] < mean["earliest-deadline"] < mean["rollout planner"], mean
