@@ -15,9 +15,10 @@ os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.05"
 
 # The tests compile for longer than they run, so machine code that is made quickly will do. Those that compare two
 # computations to the bit also run with the usual machine code: XLA_FLAGS= pytest -m bits. XLA ends the process if it does not
-# know a flag, and only jaxlib 0.10 is sure to know the second one.
+# know a flag, and only jaxlib 0.10 is sure to know the second one. (Level 1 with it makes LLVM end the process on one of our
+# programs: "Cannot select: SUBV_BROADCAST_LOAD".)
 if "XLA_FLAGS" not in os.environ:
-    os.environ["XLA_FLAGS"] = "--xla_backend_optimization_level=1"
+    os.environ["XLA_FLAGS"] = "--xla_backend_optimization_level=2"
     if version("jaxlib").startswith("0.10."):
         os.environ["XLA_FLAGS"] += " --xla_cpu_use_fusion_emitters=false"
 

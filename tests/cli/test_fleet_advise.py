@@ -41,7 +41,8 @@ def test_json_until_a_horizon(tmp_path):
     assert ada["next"]["name"] == ada["ranking"][0]["name"]
     assert {row["name"] for row in ada["ranking"]} == {"mill", "quay", "tower", "yard"}
     assert set(ada["ranking"][0]) == {"place", "name", "service", "behind", "behind_interval"}
-    assert bob["next"]["action"] == "grounded"
+    assert bob["next"] == {"place": None, "name": None, "action": "grounded"}
+    assert bob["ranking"] == []
     assert bob["returns_in"] is None
     assert advice["seconds_left"] == 2400
     low, high = advice["service"]["interval"]

@@ -69,10 +69,10 @@ def test_data_until_a_horizon():
     assert "policies" not in data
     assert "bound" not in data
     # The mill weighs as much as the others together and is in service for 1,200 s, the others all the time.
-    mill, quay, tower = data["devices"]
+    mill, quay, tower = data["device_service"]
     assert_allclose(mill["in_service"], 1200 / 3600)
     assert_allclose(
-        data["service"]["rollout"], np.average([row["in_service"] for row in data["devices"]], weights=[2, 1, 1])
+        data["service"]["rollout"], np.average([row["in_service"] for row in data["device_service"]], weights=[2, 1, 1])
     )
     assert [mill["battery_empty_slot"], mill["battery_empty_s"]] == [3, 1800]
     assert quay["battery_empty_s"] is None

@@ -70,6 +70,15 @@ def test_a_uav_at_a_depot_stands_there():
     chex.assert_trees_all_equal(state_of({"uavs": [{"at": "port", "energy_j": 5.5}]}, ONE), one)
 
 
+def test_a_uav_without_energy_is_grounded_unless_it_is_at_a_depot():
+    first, second = HARBOUR.uav_names
+    depot = HARBOUR.depot_names[0]
+    state = make_state(
+        {"uavs": {first: {"energy_j": 0, "at": NAMES[0]}, second: {"energy_j": 0, "at": depot}}}, HARBOUR, "s"
+    )
+    assert state.grounded.tolist() == [True, False]
+
+
 def test_failed_devices_have_no_energy_and_data_of_any_age():
     ages = [3, 400, 0, 0, 99]
     state = state_of({"failed_at": {"quay camera": 3}, "age_slots": ages, "slot": 9})

@@ -237,8 +237,11 @@ def trace_from(policy: Policy, params: Params, layout: Layout, state: State, key
 
 
 def tour_policy(actions: Int[Array, "H *K"]) -> Policy:
-    """Return the policy that follows a fixed tour: in each slot it takes ``actions[slot]``."""
-    return lambda params, layout, state, key=None: actions[state.slot]
+    """Return the policy that follows a fixed tour: in each slot it takes ``actions[slot]``.
+
+    Where the tour has come to its end (-1) and the network lives on, the UAVs fly to device 0.
+    """
+    return lambda params, layout, state, key=None: jnp.maximum(actions[state.slot], 0)
 
 
 def rollout_draws(policy: Policy, scenario: Scenario | ScenarioDistribution, keys: Key[Array, " D"]) -> Episode:

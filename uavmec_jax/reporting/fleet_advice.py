@@ -63,12 +63,17 @@ def _free_pads(scenario: NamedScenario) -> list[float]:
 
 
 def fleet_next_data(advice: Advice, scenario: NamedScenario) -> dict[str, Any]:
-    """Return ``uavs``: each with ``name``, ``next``, ``policy_says``, ``returns_in``, ``ranking``; places from 1."""
+    """Return ``uavs``: each with ``name``, ``next``, ``policy_says``, ``returns_in``, ``ranking``; places from 1.
+
+    A UAV that is grounded has no next place and no ranking.
+    """
     names = scenario.place_names
     actions = next_actions(advice, scenario)
     return {
         "uavs": [
-            {
+            _grounded(name)
+            if action == "grounded"
+            else {
                 "name": name,
                 "next": {"place": uav.place + 1, "name": names[uav.place], "action": action},
                 "policy_says": {"place": uav.policy_choice + 1, "name": names[uav.policy_choice]},
@@ -83,6 +88,12 @@ def fleet_next_data(advice: Advice, scenario: NamedScenario) -> dict[str, Any]:
             for name, uav, action in zip(scenario.uav_names, advice.uavs, actions, strict=True)
         ]
     }
+
+
+def _grounded(name: str) -> dict[str, Any]:
+    """Return what is said of a grounded UAV, under the same keys."""
+    nowhere = {"place": None, "name": None, "action": "grounded"}
+    return {"name": name, "next": nowhere, "policy_says": None, "returns_in": None, "ranking": []}
 
 
 def _value(candidate: Candidate) -> dict[str, Any]:

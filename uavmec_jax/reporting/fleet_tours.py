@@ -150,7 +150,7 @@ def _uav_cell(scenario: NamedScenario, uav: dict[str, Any]) -> str:
     depot = f"D{scenario.depot_names.index(uav['at_depot']) + 1}"
     if uav["depot_service"] == "swap":
         return f"{depot} swap"
-    return f"{depot} charge {energy}" if uav["depot_service"] else f"{depot} {energy}"
+    return f"{depot} {energy}+" if uav["depot_service"] else f"{depot} {energy}"
 
 
 def device_rows(params: Params, layout: Layout, tour: Trace) -> list[dict[str, Any]]:

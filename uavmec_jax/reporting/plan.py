@@ -210,7 +210,7 @@ def plan_data(plan: Plan, scenario: NamedScenario) -> dict[str, Any]:
         data["measures"] = measure_data(plan.measures)
     if plan.service is not None:
         rows = device_rows(plan.params, plan.layout, plan.tours["rollout"])
-        data["devices"] = [{"name": name} | row for name, row in zip(names, rows, strict=True)]
+        data["device_service"] = [{"name": name} | row for name, row in zip(names, rows, strict=True)]
     return data | {"what_if": change_data(plan.what_if, names)}
 
 

@@ -3,10 +3,12 @@
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Num
 from pydantic import Field
 
+from uavmec_jax.env.depots import stands_at
 from uavmec_jax.env.fleet import DepotKind
 from uavmec_jax.env.layout import fleet_of
 from uavmec_jax.files.validation import StrictModel, from_array
@@ -27,8 +29,8 @@ class UavState(StrictModel):
     """Its position, metres from the origin."""
     energy_j: Number | None = None
     """Energy left, J."""
-    grounded: bool = False
-    """Whether it is out for the rest of the episode."""
+    grounded: bool | None = None
+    """Whether it is out for the rest of the episode; by default, whether it has no energy and is at no depot."""
 
 
 class UavStates(StrictModel):
@@ -93,7 +95,7 @@ def by_name(
 def uav_arrays(
     file: UavStates, scenario: NamedScenario
 ) -> tuple[Float[np.ndarray, "K 2"], Float[np.ndarray, " K"], Bool[np.ndarray, " K"]]:
-    """Return where the UAVs are, m, their energies, J, and which of them are grounded.
+    """Return where the UAVs are, m, their energies, J, and which of them are grounded: also those without any energy.
 
     Raises:
         ValueError: a value does not fit its UAV; one line that names both.
@@ -117,7 +119,22 @@ def uav_arrays(
         ]
     position = np.array([_position(field, uav, v, scenario) for v, (field, uav) in enumerate(entries)])
     energy = np.array([_energy(field, uav, v, scenario) for v, (field, uav) in enumerate(entries)])
-    return position, energy, np.array([uav.grounded for _, uav in entries])
+    return (
+        position,
+        energy,
+        np.array([_is_grounded(uav, v, position, energy, scenario) for v, (_, uav) in enumerate(entries)]),
+    )
+
+
+def _is_grounded(
+    uav: UavState, v: int, position: Float[np.ndarray, "K 2"], energy: Float[np.ndarray, " K"], scenario: NamedScenario
+) -> bool:
+    """Return whether UAV ``v`` is grounded; if the file does not say it, whether it has no energy and is at no depot."""
+    if uav.grounded is not None:
+        return uav.grounded
+    depots = scenario.layout.depots
+    at_depot = depots is not None and bool(np.any(stands_at(depots, jnp.asarray(position[v : v + 1], jnp.float32))))
+    return bool(energy[v] == 0) and not at_depot
 
 
 def _position(field: str, uav: UavState, v: int, scenario: NamedScenario) -> Float[np.ndarray, "2"]:
