@@ -70,7 +70,8 @@ def test_a_trained_policy_decides_for_the_uavs_in_turn(tmp_path):
     done = run(tmp_path, "advise", *settings)
     advice = json.loads(done.stdout)
     line = (
-        "hamlet: the policy was trained for one UAV without depots; the UAVs decide in turn by it and return by a rule"
+        "hamlet: the policy was trained for one UAV without depots; here the UAVs decide one after another; a rule sends "
+        "UAVs to depots"
     )
     assert f"uavmec: warning: {line}" in done.stderr.splitlines()
     assert line in advice["warnings"]
@@ -88,4 +89,4 @@ def test_evaluate(tmp_path):
         assert 0 <= row["censored"] <= 1
     shown = run(tmp_path, "evaluate", "generalist", "--draws", 2, "--set", "end=first_failure").stdout
     assert "Lifetime over 2 volume draws" in shown
-    assert "the UAVs decide in turn by it" in " ".join(shown.split())
+    assert "here the UAVs decide one after another" in " ".join(shown.split())

@@ -92,7 +92,7 @@ def check_requirements(params, layout, key, volumes, tours):
 @pytest.mark.parametrize("uavs", [1, 2, 3])
 def test_tours_meet_the_requirements(uavs):
     longest = []
-    for seed in range(60):
+    for seed in range(20):
         params, layout, key, volumes = fleet_instance(seed, uavs=uavs)
         rng = np.random.default_rng(seed)
         tours = rng.integers(0, layout.n_places, (32, SLOTS, *layout.action_shape), np.int32)
@@ -103,11 +103,11 @@ def test_tours_meet_the_requirements(uavs):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first_seed", range(0, 100, 20))
+@pytest.mark.parametrize("first_seed", [0, 15])
 def test_no_optimum_exceeds_the_bound(first_seed):
     """Nor does it break a requirement, and in most instances it is the bound."""
     gaps = []
-    for seed in range(first_seed, first_seed + 20):
+    for seed in range(first_seed, first_seed + 15):
         if (solved := solved_instance(seed)) is None:
             continue
         *instance, tour = solved
@@ -117,7 +117,7 @@ def test_no_optimum_exceeds_the_bound(first_seed):
         assert upper_bound(params, layout, volumes, reached=int(tour.lifetime)) == bound, seed
         assert check_requirements(*instance, tour.actions[None]) == [tour.lifetime], seed
         gaps.append(bound - int(tour.lifetime))
-    assert len(gaps) >= 12
+    assert len(gaps) >= 10
     assert np.mean(np.array(gaps) == 0) >= 0.6
 
 

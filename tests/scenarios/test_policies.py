@@ -225,7 +225,7 @@ def test_damaged_and_foreign_files_are_refused(run, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_trained_policy_fleet_warnings_a_fleet(run):
+def test_a_trained_policy_lifted_to_a_fleet(run):
     """One UAV with a depot and three UAVs decide by the policy; without any depot, the first one does as if it were alone."""
     policy = load_policy(run, seed=1, powered=12, connected=4)
     params, layout = um.Params(), layout_for_seed(1, um.Params(), 12, 4)
@@ -241,8 +241,9 @@ def test_a_trained_policy_fleet_warnings_a_fleet(run):
     low = um.initial_state(params, depot).replace(uav_energy=jnp.array([1000.0]))
     assert policy(params, depot, low) == 12  # it stands at the depot
     assert policy.fleet_warnings(layout) == []
-    assert "the UAV returns by a rule" in policy.fleet_warnings(depot)[0]
-    assert "the UAVs decide in turn by it and return by a rule" in policy.fleet_warnings(three)[0]
+    alone = "the policy was trained for one UAV without depots"
+    assert policy.fleet_warnings(depot) == [f"{alone}; a rule sends UAVs to depots"]
+    assert policy.fleet_warnings(three) == [f"{alone}; here the UAVs decide one after another"]
 
 
 def test_rules_of_fleets_have_names():
