@@ -78,7 +78,7 @@ def test_service_is_a_share_of_the_time_left(seconds):
 def test_who_repairs_a_dead_device_replaces_its_battery():
     state = complete_state(LAYOUT, initial_state(HORIZON, LAYOUT))
     state = state.replace(battery=state.battery.at[0].set(0.0), failed_at=jnp.array([4, -1, -1]))
-    states = states_to_try(LAYOUT, state)
+    states = states_to_try(HORIZON, LAYOUT, state)
     assert states.battery.shape == layouts_to_try(HORIZON, LAYOUT).capacity.shape == (13, 3)
     assert_array_equal(states.failed_at[1], [-1, -1, -1])
     assert_array_equal(states.battery[1], LAYOUT.capacity)

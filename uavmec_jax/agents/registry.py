@@ -12,9 +12,6 @@ from uavmec_jax.agents.algorithm import Algorithm
 SCENARIO_SETTINGS = ("total_steps", "n_devices", "max_age")
 """Static settings that follow from the study and its scenarios, and are not set in files."""
 
-NO_HORIZON = "whose replay holds no ages beyond their limit; give end = 'first_failure', or take 'ppo' or 'a2c'"
-"""Why a DQN cannot be trained where episodes go on after a failure, and what to do."""
-
 
 @dataclass(frozen=True)
 class RegisteredAlgorithm:
@@ -75,3 +72,16 @@ ALGORITHMS: Mapping[str, RegisteredAlgorithm] = MappingProxyType(
     }
 )
 """The algorithms by their names in study files."""
+
+
+def check_end(algorithm: str, end: str) -> None:
+    """Check that an algorithm can be trained where episodes have a certain end.
+
+    Raises:
+        ValueError: it is a DQN, and episodes go on after a failure; one line.
+    """
+    if algorithm == "dqn" and end == "horizon":
+        raise ValueError(
+            "params.end is 'horizon', and algorithm is 'dqn', whose replay holds no ages beyond their limit; give "
+            "end = 'first_failure', or take 'ppo' or 'a2c'"
+        )

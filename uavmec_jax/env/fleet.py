@@ -75,7 +75,12 @@ UAV_FIELDS = ("speed_m_s", "flying_power_w", "hovering_power_w", "battery_j", "s
 """Fields of a :class:`Fleet` whose defaults are the parameters of the same name prefixed with ``uav_``."""
 
 
-_Range = tuple[str, Callable[[float], bool]]
+_Range = tuple[str, Callable[[float], bool]]  # in words, and whether a number is in it
+
+_FINITE: _Range = ("finite", math.isfinite)
+_POSITIVE: _Range = ("positive", lambda value: value > 0)
+_AT_LEAST_0: _Range = ("at least 0", lambda value: value >= 0)
+_AT_LEAST_1: _Range = ("at least 1", lambda value: value >= 1)
 
 
 def make_fleet(params: Params, uavs: int, depots: Depots | None = None, **values: ArrayLike | Sequence) -> Fleet:
@@ -145,7 +150,7 @@ def make_depots(
         for name, value in (("pads", pads), ("packs", packs), ("power_w", power_w))
     }
     _check("position", position, "depot", *_FINITE)
-    _check("pads", numbers["pads"], "depot", "at least 1", lambda value: value >= 1)
+    _check("pads", numbers["pads"], "depot", *_AT_LEAST_1)
     for name in ("packs", "power_w"):
         _check(name, numbers[name], "depot", *_AT_LEAST_0)
     return Depots(position=position, kind=jnp.asarray([names.index(name) for name in kinds], jnp.int32), **numbers)
@@ -164,11 +169,6 @@ def _one_each(name: str, value: Any, shape: tuple[int, ...], dtype: Any = jnp.fl
     if array.shape not in (shape, shape[1:]):
         raise ValueError(f"{name} has shape {array.shape}; it should be {shape}, or {shape[1:]} for all alike")
     return jnp.broadcast_to(array, shape)
-
-
-_FINITE: _Range = ("finite", math.isfinite)
-_AT_LEAST_0: _Range = ("at least 0", lambda value: value >= 0)
-_POSITIVE: _Range = ("positive", lambda value: value > 0)
 
 
 def _check(name: str, values: Array, what: str, expected: str, fits: Callable[[float], bool]) -> None:

@@ -108,10 +108,6 @@ class Layout:
         weight = jnp.ones(self.capacity.shape) if self.priority is None else self.priority
         return weight if self.present is None else jnp.where(self.present, weight, 0.0)
 
-    def sends_results(self) -> Bool[Array, "*batch n"]:
-        """Return the devices that send results by themselves: connected, and not padding."""
-        return self.has_comms if self.present is None else self.has_comms & self.present
-
     def failure_price(self, seconds: Num[ArrayLike, ""]) -> Float[Array, " n"]:
         """Return the price of each device's first failure, in slots of lifetime, at a time as in :meth:`Traffic.at`."""
         if self.traffic is None:

@@ -66,15 +66,13 @@ def plan_flights(
 ) -> Flights:
     """Return the flights to the UAVs' targets, places in ``[0, n + D)``, and the services that they would bring."""
     n = layout.n_devices
-    place = (
-        layout.places()[target[0]][None] if target.shape[0] == 1 else layout.places()[target]
-    )  # one is a cheap slice
+    place = layout.places()[target]
     hovers = target < n if layout.n_depots else jnp.ones(target.shape, bool)
     ground = layout.position - place[:, None]
     slant = jnp.sqrt(jnp.sum(ground**2, axis=-1) + params.uav_altitude_m**2)
     covers = (slant <= fleet.signal_range_m[:, None]) | (jnp.arange(n) == target[:, None])
     t_compute = jnp.minimum(volumes / layout.processing_rate, params.slot_cap_s)
-    t_results = jnp.where(layout.sends_results(), 8.0 * params.result_message_bytes / params.uplink_rate_bit_s, 0.0)
+    t_results = result_times(params, layout)
     return Flights(
         place=place,
         hovers=hovers,
@@ -85,6 +83,12 @@ def plan_flights(
         t_compute=t_compute,
         t_results=t_results,
     )
+
+
+def result_times(params: Params, layout: Layout) -> Float[Array, " n"]:
+    """Return the seconds in which each device that is not served sends its results: if it is connected, and not padding."""
+    sends = layout.has_comms if layout.present is None else layout.has_comms & layout.present
+    return jnp.where(sends, 8.0 * params.result_message_bytes / params.uplink_rate_bit_s, 0.0)
 
 
 def services_of(
@@ -102,9 +106,7 @@ def services_of(
     covers = flights.covers if started is None else flights.covers & started[:, None]
     covers = covers if living is None else covers & living
     served = jnp.any(covers, axis=0)
-    through = flights.t_fly[:, None] + flights.t_upload
-    if covers.shape[0] > 1:  # (with one UAV, only what is served counts)
-        through = jnp.where(covers, through, jnp.inf)
+    through = jnp.where(covers, flights.t_fly[:, None] + flights.t_upload, jnp.inf)
     busy = jnp.where(served, jnp.min(through, axis=0), flights.t_work)
     duration = jnp.max(busy if living is None else jnp.where(living, busy, -jnp.inf))
     if started is not None:  # (alone, a UAV serves its target, which takes longer than the flight)

@@ -25,7 +25,7 @@ from uavmec_jax.planning.rollout_planner import candidates_of, prefer, try_candi
 _RETURN_SAMPLES = 32
 """Futures in which it is looked up when the UAVs return to a depot."""
 
-_RETURN_SLOTS = 128
+RETURN_SLOTS = 128
 """Slots within which it is looked up; a UAV of the paper has to return after 33."""
 
 
@@ -213,9 +213,9 @@ def _returns_in(
         def act(params: Params, layout: Layout, later: State, key: PRNGKeyArray | None = None) -> Array:
             return jnp.where(later.slot == state.slot, action, policy(params, layout, later, key))
 
-        slots = trace_from(act, params, layout, state, future, _RETURN_SLOTS)
+        slots = trace_from(act, params, layout, state, future, RETURN_SLOTS)
         flies = slots.played[:, None] & ~jnp.concatenate([state.grounded[None], slots.state.grounded[:-1]])
-        to_depot = flies & (slots.action.reshape(_RETURN_SLOTS, -1) >= layout.n_devices)
+        to_depot = flies & (slots.action.reshape(RETURN_SLOTS, -1) >= layout.n_devices)
         first, ever = jnp.argmax(to_depot, axis=0), jnp.any(to_depot, axis=0)
         begins = jnp.append(jnp.asarray(state.elapsed), slots.state.elapsed)
         seconds = begins[first] - state.elapsed
@@ -228,19 +228,16 @@ def _try_changes(
     policy: Policy, params: Params, layout: Layout, state: State, futures: Key[Array, " S"]
 ) -> tuple[WhatIf, ...]:
     """Return the effect of every change of one device if the policy decides from the present state on."""
-    goes_on = params.end == "horizon"
-    states = states_to_try(layout, state) if goes_on else state
-    episodes = _play_layouts(policy, params, layouts_to_try(params, layout), states, futures, 0 if goes_on else None)
+    layouts, states = layouts_to_try(params, layout), states_to_try(params, layout, state)
+    episodes = _play_layouts(policy, params, layouts, states, futures)
     return rank_changes(params, layout, episodes, _seconds_left(params, state))
 
 
-@partial(jax.jit, static_argnames=("policy", "states_axis"))
-def _play_layouts(
-    policy: Policy, params: Params, layouts: Layout, states: State, futures: Key[Array, " S"], states_axis: int | None
-) -> Episode:
-    """Return the episode of every future for each of ``L`` layouts, leaves ``[L, S, ...]``, from one state or ``L``."""
+@partial(jax.jit, static_argnames="policy")
+def _play_layouts(policy: Policy, params: Params, layouts: Layout, states: State, futures: Key[Array, " S"]) -> Episode:
+    """Return the episode of every future for each of ``L`` layouts from its own state, leaves ``[L, S, ...]``."""
     play = lambda layout, state, future: rollout_from(policy, params, layout, state, future)  # noqa: E731
-    return jax.vmap(jax.vmap(play, (None, None, 0)), (0, states_axis, None))(layouts, states, futures)
+    return jax.vmap(jax.vmap(play, (None, None, 0)), (0, 0, None))(layouts, states, futures)
 
 
 def _rank(

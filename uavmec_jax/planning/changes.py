@@ -2,16 +2,19 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Num
+from jaxtyping import Array, Float, Num
 
 from uavmec_jax.env.dynamics import State
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Episode
+
+_T = TypeVar("_T", Layout, State)
 
 CHANGES = ("repair power", "repair comms", "remove")
 """Names of the changes, in the order of :func:`every_change`."""
@@ -79,31 +82,29 @@ def layouts_to_try(params: Params, layout: Layout) -> Layout:
     return _stack([marked, *every_change(marked), *ignored])
 
 
-def states_to_try(layout: Layout, state: State) -> State:
-    """Return the state from which each of :func:`layouts_to_try` with a horizon goes on, leaves ``[L, ...]``.
+def states_to_try(params: Params, layout: Layout, state: State) -> State:
+    """Return the state from which each of :func:`layouts_to_try` goes on, leaves ``[L, ...]``.
 
     They are all ``state``, except that whoever repairs the power of a dead device replaces its battery.
     """
-    full = jnp.asarray(layout.capacity, jnp.float32)
+    devices = jnp.arange(layout.n_devices)
 
-    def repaired(device: int) -> State:
-        at = state.failed_at[device]
-        battery = jnp.where(at < 0, state.battery[device], full[device])
-        return replace(
-            state, battery=state.battery.at[device].set(battery), failed_at=state.failed_at.at[device].set(-1)
-        )
+    def repaired(device: Array) -> State:
+        revived = (devices == device) & (state.failed_at >= 0)
+        battery = jnp.where(revived, layout.capacity, state.battery)
+        return replace(state, battery=battery, failed_at=jnp.where(revived, -1, state.failed_at))
 
-    devices = range(layout.n_devices)
-    others = [state] * (len(CHANGES) * layout.n_devices)  # the other changes, and the devices that weigh nothing
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), state, *map(repaired, devices), *others)
+    others = len(CHANGES) - 1 if params.end == "first_failure" else len(CHANGES)  # with the devices that weigh nothing
+    return _stack([state, *map(repaired, devices), *[state] * (others * layout.n_devices)])
 
 
 def _marked(layout: Layout) -> jax.Array:
     return jnp.ones(layout.n_devices, bool) if layout.present is None else layout.present
 
 
-def _stack(layouts: list[Layout]) -> Layout:
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *layouts)
+def _stack(trees: list[_T]) -> _T:
+    stacked: _T = jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+    return stacked
 
 
 def rank_changes(params: Params, layout: Layout, episodes: Episode, seconds: float) -> tuple[WhatIf, ...]:

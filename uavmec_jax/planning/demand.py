@@ -19,6 +19,7 @@ from uavmec_jax.env.dynamics import slots_to_expiry
 from uavmec_jax.env.fleet import Fleet
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
+from uavmec_jax.env.slot import result_times
 
 _ROUNDING = 1e-5
 """Relative tolerance for single precision, always applied in favour of the network."""
@@ -64,8 +65,7 @@ def work_times(
 ) -> tuple[Float[Array, "H n"], Float[Array, " n"]]:
     """Return the seconds that each device computes if it is not served, and those in which it then sends its results."""
     t_compute = jnp.minimum(volumes / layout.processing_rate, params.slot_cap_s)
-    t_results = 8.0 * params.result_message_bytes / params.uplink_rate_bit_s
-    return t_compute, jnp.where(layout.sends_results(), t_results, 0.0)
+    return t_compute, result_times(params, layout)
 
 
 def _slant(params: Params, layout: Layout) -> Float[Array, "n n"]:

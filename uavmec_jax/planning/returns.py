@@ -15,6 +15,7 @@ from uavmec_jax.env.dynamics import State, slots_to_expiry
 from uavmec_jax.env.fleet import DepotKind, Depots, Fleet
 from uavmec_jax.env.layout import Layout, fleet_of
 from uavmec_jax.env.params import Params
+from uavmec_jax.env.slot import result_times
 
 _TOP_UP_SLOTS = 12.0
 """A UAV that nothing needs returns if its energy lasts for fewer slots."""
@@ -145,9 +146,7 @@ def _longest_slot(
 ) -> Float[Array, ""]:
     """Return the seconds that no slot exceeds, wherever the UAVs fly."""
     present, flies = _present(layout), ~state.grounded
-    t_results = jnp.where(
-        jnp.any(layout.sends_results()), 8.0 * params.result_message_bytes / params.uplink_rate_bit_s, 0.0
-    )
+    t_results = jnp.max(result_times(params, layout))
     distance = jnp.linalg.norm(layout.places() - state.uav_position[:, None], axis=-1)
     t_fly = distance / fleet.speed_m_s[:, None]
     goals = flies[:, None] & jnp.concatenate([present, helps])

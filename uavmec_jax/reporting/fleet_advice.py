@@ -1,6 +1,7 @@
 """Advice to a fleet, or until a horizon: what each UAV does next, and when it returns to a depot."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ from rich.table import Table
 from uavmec_jax.env.depots import can_help
 from uavmec_jax.env.fleet import DepotKind
 from uavmec_jax.env.layout import fleet_of
-from uavmec_jax.planning.advice import Advice, Candidate, UavAdvice
+from uavmec_jax.planning.advice import RETURN_SLOTS, Advice, Candidate, UavAdvice
 from uavmec_jax.reporting.labels import duration, place_label
 from uavmec_jax.scenarios.named_scenario import NamedScenario
 
@@ -67,33 +68,24 @@ def fleet_next_data(advice: Advice, scenario: NamedScenario) -> dict[str, Any]:
 
     A UAV that is grounded has no next place and no ranking.
     """
-    names = scenario.place_names
-    actions = next_actions(advice, scenario)
+    uavs = zip(scenario.uav_names, advice.uavs, next_actions(advice, scenario), strict=True)
+    return {"uavs": [{"name": name} | _uav_data(uav, action, scenario.place_names) for name, uav, action in uavs]}
+
+
+def _uav_data(uav: UavAdvice, action: str, names: Sequence[str]) -> dict[str, Any]:
+    if action == "grounded":
+        nowhere = {"place": None, "name": None, "action": action}
+        return {"next": nowhere, "policy_says": None, "returns_in": None, "ranking": []}
+    returns_in = {"slots": uav.returns_in, "seconds": round(uav.returns_in_s, 1)}
     return {
-        "uavs": [
-            _grounded(name)
-            if action == "grounded"
-            else {
-                "name": name,
-                "next": {"place": uav.place + 1, "name": names[uav.place], "action": action},
-                "policy_says": {"place": uav.policy_choice + 1, "name": names[uav.policy_choice]},
-                "returns_in": None
-                if math.isnan(uav.returns_in)
-                else {"slots": uav.returns_in, "seconds": round(uav.returns_in_s, 1)},
-                "ranking": [
-                    {"place": candidate.place + 1, "name": names[candidate.place], **_value(candidate)}
-                    for candidate in uav.candidates
-                ],
-            }
-            for name, uav, action in zip(scenario.uav_names, advice.uavs, actions, strict=True)
-        ]
+        "next": {"place": uav.place + 1, "name": names[uav.place], "action": action},
+        "policy_says": {"place": uav.policy_choice + 1, "name": names[uav.policy_choice]},
+        "returns_in": None if math.isnan(uav.returns_in) else returns_in,
+        "ranking": [
+            {"place": candidate.place + 1, "name": names[candidate.place], **_value(candidate)}
+            for candidate in uav.candidates
+        ],
     }
-
-
-def _grounded(name: str) -> dict[str, Any]:
-    """Return what is said of a grounded UAV, under the same keys."""
-    nowhere = {"place": None, "name": None, "action": "grounded"}
-    return {"name": name, "next": nowhere, "policy_says": None, "returns_in": None, "ranking": []}
 
 
 def _value(candidate: Candidate) -> dict[str, Any]:
@@ -159,6 +151,6 @@ def _return(uav: UavAdvice, action: str) -> str:
     if uav.returns_in == 0:
         return ""
     if math.isnan(uav.returns_in):
-        return "; no return to a depot within 128 slots in most futures"
+        return f"; no return to a depot within {RETURN_SLOTS} slots in most futures"
     slots = f"{uav.returns_in:g} slot{'s' * (uav.returns_in != 1)}"
     return f"; it returns to a depot in {duration(uav.returns_in_s)} ({slots})"

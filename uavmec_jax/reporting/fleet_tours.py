@@ -81,7 +81,8 @@ def fleet_table(rows: Sequence[dict[str, Any]], scenario: NamedScenario) -> Tabl
     """Return a table of the slots of a tour; slots in which no UAV flies and nothing else changes share a row.
 
     Places have their numbers: ``#1`` for a device, ``D1`` for a depot. After the place comes the energy left in the UAV, in
-    kJ; after a swap the battery is full. Devices whose battery is empty are in a column of their own, if there are any.
+    kJ; after a swap the battery is full, and ``+`` says that it is being charged. Devices whose battery is empty are in a
+    column of their own, if there are any.
 
     Args:
         rows: from :func:`fleet_rows`.

@@ -34,9 +34,9 @@ def censored_share(share: float) -> str:
     return f" ({share:.0%} censored)" if share > 0 else ""
 
 
-def at_least(cell: Any, policy: str) -> str:
-    """Return the sign in front of a mean lifetime that is only known to be no shorter: some of the episodes are censored."""
-    return "≥" if cell.get(f"{policy}_censored", 0.0) > 0 else ""
+def is_censored(cell: Any, policy: str) -> bool:
+    """Return whether some of a policy's episodes in a cell are censored; their mean lifetime is then at least the number."""
+    return bool(cell.get(f"{policy}_censored", 0.0) > 0)
 
 
 def cell_name(cell: Any, axes: Iterable[str]) -> str:

@@ -8,12 +8,12 @@ from rich.table import Table
 from rich.text import Text
 
 from uavmec_jax.reporting.formatting import (
-    at_least,
     axis_values,
     censored,
     column_name,
     first_to_fail,
     half_interval,
+    is_censored,
     percent,
     slots,
 )
@@ -110,7 +110,7 @@ def gap_table(results: Results, cells: pd.DataFrame) -> Table:
 
     def steps(cell: Any) -> Text:
         gaps = zip(results.gaps, gap_percent(results, cell).values(), strict=True)
-        return Text("\n".join(percent(gap) + "*" * bool(at_least(cell, upper)) for (upper, _), gap in gaps))
+        return Text("\n".join(percent(gap) + "*" * is_censored(cell, upper) for (upper, _), gap in gaps))
 
     return _grid(cells, steps)
 
@@ -145,10 +145,11 @@ def _is_papers_fleet(results: Results) -> bool:
 
 def _lifetime(cell: Any, policy: str, baselines: list[str], with_paper: bool) -> Text:
     paper = TABLE5.get((cell["powered"], cell["connected"])) if with_paper else None
-    text = Text(f"{at_least(cell, policy)}{cell[policy]:.1f}", style=_style(cell[policy], paper))
+    mean = lambda name: f"{'≥' * is_censored(cell, name)}{cell[name]:.1f}"  # noqa: E731
+    text = Text(mean(policy), style=_style(cell[policy], paper))
     text.append(half_interval(cell[f"{policy}_low"], cell[f"{policy}_high"]), style="dim")
     compared = [f"{paper:g}" if paper is not None else "-"] * with_paper
-    compared += [f"{at_least(cell, baseline)}{cell[baseline]:.1f}" for baseline in baselines]
+    compared += map(mean, baselines)
     separator = "\n" if f"{policy}_censored" in cell else " / "  # signs take room
     return text.append(f"\n{separator.join(compared)}" if compared else "", style="not bold default")
 

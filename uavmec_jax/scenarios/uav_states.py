@@ -3,12 +3,10 @@
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Num
 from pydantic import Field
 
-from uavmec_jax.env.depots import stands_at
 from uavmec_jax.env.fleet import DepotKind
 from uavmec_jax.env.layout import fleet_of
 from uavmec_jax.files.validation import StrictModel, from_array
@@ -119,22 +117,17 @@ def uav_arrays(
         ]
     position = np.array([_position(field, uav, v, scenario) for v, (field, uav) in enumerate(entries)])
     energy = np.array([_energy(field, uav, v, scenario) for v, (field, uav) in enumerate(entries)])
-    return (
-        position,
-        energy,
-        np.array([_is_grounded(uav, v, position, energy, scenario) for v, (_, uav) in enumerate(entries)]),
-    )
+    uavs = zip(entries, position, energy.tolist(), strict=True)
+    grounded = [_is_grounded(uav, where, left, scenario) for (_, uav), where, left in uavs]
+    return position, energy, np.array(grounded)
 
 
-def _is_grounded(
-    uav: UavState, v: int, position: Float[np.ndarray, "K 2"], energy: Float[np.ndarray, " K"], scenario: NamedScenario
-) -> bool:
-    """Return whether UAV ``v`` is grounded; if the file does not say it, whether it has no energy and is at no depot."""
+def _is_grounded(uav: UavState, position: Float[np.ndarray, "2"], energy: float, scenario: NamedScenario) -> bool:
+    """Return whether a UAV is grounded; if the file does not say it, whether it has no energy and is at no depot."""
     if uav.grounded is not None:
         return uav.grounded
-    depots = scenario.layout.depots
-    at_depot = depots is not None and bool(np.any(stands_at(depots, jnp.asarray(position[v : v + 1], jnp.float32))))
-    return bool(energy[v] == 0) and not at_depot
+    depots = np.asarray(scenario.layout.places())[scenario.layout.n_devices :]
+    return energy == 0 and place_at(position, depots, scenario.depot_names) is None
 
 
 def _position(field: str, uav: UavState, v: int, scenario: NamedScenario) -> Float[np.ndarray, "2"]:

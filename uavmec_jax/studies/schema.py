@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, get_args
 import pydantic
 from pydantic import Field
 
-from uavmec_jax.agents.registry import ALGORITHMS, NO_HORIZON, SCENARIO_SETTINGS
+from uavmec_jax.agents.registry import ALGORITHMS, SCENARIO_SETTINGS, check_end
 from uavmec_jax.env.fleet import MAX_UAVS
 from uavmec_jax.env.rewards import DEFAULT_REWARD, LOG_GUARDS
 from uavmec_jax.files.validation import StrictModel, from_array, model_from_dataclasses
@@ -223,8 +223,8 @@ def _check_horizon(study: Study) -> None:
             f"evaluation.planners has {asked[0]!r}, which is about the first failure, and params.end is 'horizon'; give "
             "planners = ['rollout'] or []"
         )
-    if study.params.end == "horizon" and "dqn" in study.algorithms:
-        raise ValueError(f"params.end is 'horizon', and algorithm is 'dqn', {NO_HORIZON}")
+    for algorithm in study.algorithms:
+        check_end(algorithm, study.params.end)
 
 
 def _check_algorithms(study: Study) -> None:

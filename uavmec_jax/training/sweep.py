@@ -12,7 +12,7 @@ import pandas as pd
 from jaxtyping import PRNGKeyArray
 
 from uavmec_jax.agents.algorithm import Agent, Algorithm
-from uavmec_jax.agents.registry import ALGORITHMS, NO_HORIZON, RegisteredAlgorithm
+from uavmec_jax.agents.registry import ALGORITHMS, RegisteredAlgorithm, check_end
 from uavmec_jax.env.layout import check_one_uav
 from uavmec_jax.env.params import leaf_dtype
 from uavmec_jax.env.rollout import Policy
@@ -125,10 +125,9 @@ def _check_scenarios(algorithm: str, scenarios: Scenario) -> None:
     """Check that an algorithm can train on scenarios."""
     try:
         check_one_uav(scenarios.layout, "training")
+        check_end(algorithm, scenarios.params.end)
     except ValueError as error:
         raise StudyError(str(error)) from None
-    if algorithm == "dqn" and scenarios.params.end == "horizon":
-        raise StudyError(f"params.end is 'horizon', and algorithm is 'dqn', {NO_HORIZON}")
 
 
 def _bind(
