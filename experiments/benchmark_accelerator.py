@@ -1,16 +1,21 @@
-"""Table 5 with 30 seeds on an accelerator, and the speed of training and of the environment there.
+"""The speed of the environment and of training on an accelerator, where the time goes there, and Table 5 with 30 seeds.
 
     uv run --extra cuda python experiments/benchmark_accelerator.py --out results/gpu
 
 Training is timed on filled replay buffers, as in `benchmark_dqn.py`. Prints a table and writes ``throughput.json``, with a
-description of the machine; the run of Table 5 (750 agents x 1,000,000 steps) goes to ``table5`` and is resumed if the
-script is started again. It also runs on a CPU, where ``--quick`` is a test of the script.
+description of the machine, after each part; the run of Table 5 (750 agents x 1,000,000 steps) goes to ``table5`` and is
+resumed if the script is started again. It also runs on a CPU (``JAX_PLATFORMS=cpu``), where ``--quick`` is a test of the
+script; the profile needs a GPU.
 """
 
 import argparse
 from pathlib import Path
+from typing import Any
 
-from benchmark_dqn import train_speed
+import jax
+from benchmark_dqn import train_speed as dqn_speed
+from benchmark_on_policy import train_speed as on_policy_speed
+from device_profile import profile_training
 from reports import write_report
 
 from uavmec_jax.reporting import canvas, figures
@@ -19,41 +24,93 @@ from uavmec_jax.studies.study import load_study
 from uavmec_jax.training import host
 from uavmec_jax.training.environment_speed import environment_speed
 
+PARTS = ("environment", "fleet", "training", "on_policy", "profile", "table5")
+"""What is measured, in this order."""
 POPULATIONS = (75, 750, 7500)
 """Numbers of agents that train together."""
 LAYOUTS = (4096, 1_000_000)
 """Numbers of layouts that are played together with random actions."""
+FILLED = {75: 100_000, 750: 100_000, 7500: 12_000}
+"""Transitions per agent in the replay buffers when the clock starts: what fits into the memory of one GPU."""
+
+
+def measure_environment(quick: bool, seconds: float) -> list[dict]:
+    """Measure random actions in many layouts."""
+    rows = []
+    for layouts in (1000,) if quick else LAYOUTS:
+        rows.append({"layouts": layouts, "steps_per_second": round(environment_speed(layouts, seconds))})
+        print(f"environment, {layouts:>9,} layouts: {rows[-1]['steps_per_second']:>14,} steps/s", flush=True)
+    return rows
+
+
+def measure_fleet(quick: bool, seconds: float) -> list[dict]:
+    """Measure random actions of three UAVs with a depot."""
+    rows = []
+    for layouts in (100,) if quick else (4096, 131_072):
+        speed = environment_speed(layouts, seconds, uavs=3, depot=True)
+        rows.append({"layouts": layouts, "uavs": 3, "depot": True, "slots_per_second": round(speed)})
+        print(f"three UAVs, {layouts:>10,} layouts: {round(speed):>14,} slots/s", flush=True)
+    return rows
+
+
+def measure_training(quick: bool, seconds: float) -> list[dict]:
+    """Measure the DQN's training."""
+    rows = []
+    for agents in (2,) if quick else POPULATIONS:
+        rows.append(dqn_speed(agents, seconds, filled=FILLED.get(agents, 4_000)))
+        print(f"dqn, {agents:>17,} agents: {rows[-1]['steps_per_second']:>14,.0f} steps/s", flush=True)
+    return rows
+
+
+def measure_on_policy(quick: bool, seconds: float) -> list[dict]:
+    """Measure PPO's training with one and with 64 environments per agent."""
+    rows = []
+    for agents, n_envs in ((2, 1),) if quick else ((75, 1), (75, 64), (750, 64)):
+        changes = {} if n_envs == 1 else {"ppo.n_steps": 32}
+        rows.append(on_policy_speed("ppo", agents, seconds, n_envs, changes))
+        speed = rows[-1]["steps_per_second"]
+        print(f"ppo, {agents:>7,} agents x {n_envs:>2} environments: {speed:>12,.0f} steps/s", flush=True)
+    return rows
+
+
+def measure_table5(quick: bool, directory: Path) -> dict:
+    """Run Table 5 with 30 seeds, or go on with it."""
+    heuristics_only = {"evaluation.planners": [], "evaluation.baselines": ["oldest-first"]}
+    changes = {"axes.seeds": 1, "steps": 400} | heuristics_only if quick else {"axes.seeds": 30}
+    results = run_or_resume(load_study("table5", changes), directory, command="uavmec run table5 --seeds 30")
+    canvas.save(figures.run_figure(results), directory / "figure.png")
+    speed, seconds = results.run["training_steps_per_second"], results.run["seconds"]
+    print(f"table5: {len(results.agents)} agents, {speed:,} steps/s, {seconds['wall']:,.0f} s in all")
+    return {"agents": len(results.agents), "steps_per_second": speed, "seconds": seconds}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder for the results")
     parser.add_argument("--seconds", type=float, default=20.0, help="length of each measurement")
+    parser.add_argument(
+        "--parts", nargs="+", choices=PARTS, default=PARTS, help="what to measure; by default all of it"
+    )
     parser.add_argument("--quick", action="store_true", help="small sizes: a test of the script")
     arguments = parser.parse_args()
     host.use_all_cores()
 
-    quick = arguments.quick
-    report = {"command": "python experiments/benchmark_accelerator.py" + " --quick" * quick, **host.describe()}
-    report["environment"] = []
-    for layouts in (1000,) if quick else LAYOUTS:
-        speed = environment_speed(layouts, arguments.seconds)
-        report["environment"].append({"layouts": layouts, "steps_per_second": round(speed)})
-        print(f"environment, {layouts:>9,} layouts: {speed:>14,.0f} steps/s", flush=True)
-    report["training"] = []
-    for agents in (2,) if quick else POPULATIONS:
-        row = train_speed(agents, arguments.seconds)
-        report["training"].append(row)
-        print(f"training, {agents:>6,} agents: {row['steps_per_second']:>14,.0f} steps/s", flush=True)
-    write_report(arguments.out / "throughput.json", report)
-
-    heuristics_only = {"evaluation.planners": [], "evaluation.baselines": ["oldest-first"]}
-    changes = {"axes.seeds": 1, "steps": 400} | heuristics_only if quick else {"axes.seeds": 30}
-    directory = arguments.out / "table5"
-    results = run_or_resume(load_study("table5", changes), directory, command="uavmec run table5 --seeds 30")
-    canvas.save(figures.run_figure(results), directory / "figure.png")
-    speed, seconds = results.run["training_steps_per_second"], results.run["seconds"]
-    print(f"table5: {len(results.agents)} agents, {speed:,} steps/s, {seconds['wall']:,.0f} s in all")
+    quick, seconds = arguments.quick, arguments.seconds
+    report: dict[str, Any] = {
+        "command": "python experiments/benchmark_accelerator.py" + " --quick" * quick,
+        **host.describe(),
+    }
+    measures = {
+        "environment": lambda: measure_environment(quick, seconds),
+        "fleet": lambda: measure_fleet(quick, seconds),
+        "training": lambda: measure_training(quick, seconds),
+        "on_policy": lambda: measure_on_policy(quick, seconds),
+        "profile": lambda: None if jax.default_backend() == "cpu" else profile_training(),
+        "table5": lambda: measure_table5(quick, arguments.out / "table5"),
+    }
+    for part in arguments.parts:
+        report[part] = measures[part]()
+        write_report(arguments.out / "throughput.json", report)
 
 
 if __name__ == "__main__":

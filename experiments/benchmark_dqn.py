@@ -25,8 +25,8 @@ POPULATIONS = (1, 8, 75, 300)
 """Numbers of agents that train together."""
 
 
-def train_speed(n_agents: int, seconds: float) -> dict:
-    """Measure the environment steps/s of training with ``n_agents`` agents and filled replay buffers."""
+def train_speed(n_agents: int, seconds: float, filled: int = FILLED) -> dict:
+    """Measure the environment steps/s of training with ``n_agents`` agents and ``filled`` transitions in each replay."""
     import jax
     import jax.numpy as jnp
     from training_speed import training_speed
@@ -34,19 +34,19 @@ def train_speed(n_agents: int, seconds: float) -> dict:
     from uavmec_jax.studies.study import parse_study
 
     axes = f"[axes]\npowered = [8]\nconnected = [8]\nseeds = {n_agents}"
-    study = parse_study(f"steps = {2 * FILLED}\n{axes}", "benchmark")
+    study = parse_study(f"steps = {2 * filled}\n{axes}", "benchmark")
     warm_up = 1000
-    repeats = FILLED // warm_up // 4
+    repeats = filled // warm_up // 4
 
     @partial(jax.jit, donate_argnums=0)
     def fill(rows: jax.Array) -> jax.Array:
         """Repeat the transitions of the warm-up."""
-        return rows.at[:, 1 : FILLED + 1].set(jnp.tile(rows[:, 1 : 4 * warm_up + 1], (1, repeats, 1)))
+        return rows.at[:, 1 : filled + 1].set(jnp.tile(rows[:, 1 : 4 * warm_up + 1], (1, repeats, 1)))
 
     def prepare(state: Any) -> Any:
         return state.replace(buffer_state=fill(state.buffer_state))
 
-    return {"agents": n_agents} | training_speed(study, seconds, warm_up=warm_up, start=FILLED // 4, prepare=prepare)
+    return {"agents": n_agents} | training_speed(study, seconds, warm_up=warm_up, start=filled // 4, prepare=prepare)
 
 
 def ceiling(agents_per_device: int, seconds: float) -> float:

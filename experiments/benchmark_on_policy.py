@@ -11,7 +11,9 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from reports import write_report
 
@@ -20,14 +22,16 @@ POPULATIONS = (1, 8, 75, 300)
 """Numbers of agents that train together."""
 
 
-def train_speed(algorithm: str, n_agents: int, seconds: float, n_envs: int = 1) -> dict:
+def train_speed(
+    algorithm: str, n_agents: int, seconds: float, n_envs: int = 1, changes: Mapping[str, Any] = {}
+) -> dict:
     """Measure the environment steps/s of training with ``n_agents`` agents of ``n_envs`` environments each."""
     from training_speed import training_speed
 
     from uavmec_jax.studies.study import parse_study
 
     axes = f"[axes]\npowered = [8]\nconnected = [8]\nseeds = {n_agents}"
-    study = parse_study(f"algorithm = '{algorithm}'\n{axes}", "benchmark", {f"{algorithm}.n_envs": n_envs})
+    study = parse_study(f"algorithm = '{algorithm}'\n{axes}", "benchmark", {f"{algorithm}.n_envs": n_envs, **changes})
     return {"algorithm": algorithm, "agents": n_agents, "n_envs": n_envs} | training_speed(study, seconds)
 
 

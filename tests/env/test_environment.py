@@ -33,7 +33,7 @@ def layout_of(seed, powered=8, connected=8, params=PARAMS):
 @both_modes
 def test_first_observation_is_ones_then_zeros():
     observation, state = ENV.reset(jax.random.key(0))
-    assert_array_equal(observation, [1.0] * 12 + [0.0] * 12)
+    assert_allclose(observation, [1.0] * 12 + [0.0] * 12, rtol=2e-7)  # a GPU divides to the last bit but one
     assert observation.dtype == jnp.float32
     assert state.slot == 0
     assert ENV.num_actions(ENV.default_params) == 12
@@ -53,7 +53,7 @@ def test_step_resets_automatically_and_keeps_the_final_observation():
         assert previous.slot == slot
     assert info["cause"] == Cause.DATA_AGE
     assert info["final_observation"][12:].max() == 11
-    assert_array_equal(observation, [1.0] * 12 + [0.0] * 12)
+    assert_allclose(observation, [1.0] * 12 + [0.0] * 12, rtol=2e-7)  # a GPU divides to the last bit but one
     assert state.slot == 0
 
 

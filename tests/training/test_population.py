@@ -39,7 +39,9 @@ def train(agents, steps=2000, partition=None, validation=None, **spec):
     return list(shards), progress
 
 
-def test_shards_are_equal_cover_the_population_and_fit():
+def test_shards_are_equal_cover_the_population_and_fit(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    monkeypatch.setattr(jax, "local_device_count", lambda: 2)
     expected = Partition(shards=4, shard_size=64, groups=2, shard_bytes=64 * 64 * 10**6)
     assert partition_population(250, 64 * 10**6, 16 * GIB) == expected
     assert partition_population(1, 10, GIB) == Partition(shards=1, shard_size=1, groups=1, shard_bytes=10)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from uavmec_jax.env.fixed_point import order_independent_sum
+from uavmec_jax.env.products import product
 from uavmec_jax.env.types import Scalar
 
 Weights = Any
@@ -17,22 +18,23 @@ Weights = Any
 
 @jax.custom_vjp
 def matmul(x: Float[Array, "... i"], w: Float[Array, "i o"]) -> Float[Array, "... o"]:
-    """Return ``x @ w``. The backward pass transposes its operands in memory first.
+    """Return ``x @ w``. On a CPU the backward pass transposes its operands in memory first.
 
-    On a CPU, XLA's matrix products are two to three times slower on the memory layout that plain autodiff produces. The
+    There, XLA's matrix products are two to three times slower on the memory layout that plain autodiff produces. The
     barrier keeps XLA from optimising the transposed copies away. The result is that of ``x @ w``, to the bit.
     """
-    return x @ w
+    return product(x, w)
 
 
 def _matmul_forward(x: Array, w: Array) -> tuple[Array, tuple[Array, Array]]:
-    return x @ w, (x, w)
+    return product(x, w), (x, w)
 
 
 def _matmul_backward(residuals: tuple[Array, Array], gradient: Array) -> tuple[Array, Array]:
     x, w = residuals
-    x_t, w_t = jax.lax.optimization_barrier((jnp.swapaxes(x, -1, -2), w.T))
-    return gradient @ w_t, x_t @ gradient
+    transposed = (jnp.swapaxes(x, -1, -2), w.T)
+    x_t, w_t = jax.lax.optimization_barrier(transposed) if jax.default_backend() == "cpu" else transposed
+    return product(gradient, w_t), product(x_t, gradient)
 
 
 matmul.defvjp(_matmul_forward, _matmul_backward)
@@ -54,7 +56,7 @@ class TorchDense(nn.Module):
 
         kernel = self.param("kernel", uniform, (fan_in, self.features))
         bias = self.param("bias", uniform, (self.features,))
-        return (matmul(x, kernel) if x.ndim > 1 else x @ kernel) + bias
+        return (matmul(x, kernel) if x.ndim > 1 else product(x, kernel)) + bias
 
 
 def orthogonal(key: PRNGKeyArray, shape: tuple[int, int], gain: float) -> Float[Array, "i o"]:
@@ -69,7 +71,7 @@ def orthogonal(key: PRNGKeyArray, shape: tuple[int, int], gain: float) -> Float[
     def add_column(k: Int[Array, ""], basis: Float[Array, "r c"]) -> Float[Array, "r c"]:
         column = gaussian[:, k]
         for _ in range(2):
-            column = column - basis @ (column @ basis)
+            column = column - product(basis, product(column, basis))
         return basis.at[:, k].set(column / jnp.linalg.norm(column))
 
     basis = gain * jax.lax.fori_loop(0, columns, add_column, jnp.zeros((rows, columns)))

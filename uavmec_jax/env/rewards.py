@@ -13,6 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 from uavmec_jax.env.dynamics import Outcome, State, complete_state, living_devices, service
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
+from uavmec_jax.env.products import product
 from uavmec_jax.env.types import Scalar
 
 TERMS: tuple[str, ...] = ("A", "U", "M", "O", "log A", "log U", "log M", "log O")
@@ -238,7 +239,7 @@ def reward_of(
     if reward.function is not None:
         named = dict(zip(TERMS, terms, strict=True)) | {SERVICE_TERM: service(params, layout, after)}
         return jnp.asarray(reward.function(named), jnp.float32) + survival
-    total = jnp.dot(reward.weights, terms) + survival
+    total = product(reward.weights, terms) + survival
     return total if reward.service is None else total + reward.service * service(params, layout, after)
 
 
@@ -258,6 +259,6 @@ def traffic_reward(
     if layout.traffic is None:
         return jnp.zeros(())
     weight = layout.traffic.at(before.elapsed)
-    failed_weight = jnp.dot(outcome.first_failure, weight)
+    failed_weight = product(outcome.first_failure, weight)
     visited_weight = _largest_at_targets(layout, before, action, weight, living)
     return jnp.asarray(reward.traffic_bonus * visited_weight - reward.traffic_penalty * failed_weight, jnp.float32)

@@ -10,6 +10,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 from uavmec_jax.env.dynamics import State, slots_to_expiry
 from uavmec_jax.env.layout import Layout, fleet_of
 from uavmec_jax.env.params import Params
+from uavmec_jax.env.products import product
 from uavmec_jax.planning import demand, fleet_demand
 from uavmec_jax.planning.demand import SlotCosts
 
@@ -89,7 +90,7 @@ def score(
     room, servers, spare, crowded = _what_is_left(problem, slot, target, states, exact)
     lost = (
         jnp.any(infeasible, axis=-1)
-        | (visits @ visit_share > room + 1e-3)
+        | (product(visits, visit_share) > room + 1e-3)
         | demand.misses_deadline(params, layout, visit_share, states.age, remaining, servers)
         | (spare < 0.0)
     ) & (remaining >= 0)

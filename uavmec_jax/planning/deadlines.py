@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from uavmec_jax.env.dynamics import State, slots_to_expiry
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
+from uavmec_jax.env.products import product
 from uavmec_jax.planning import demand
 from uavmec_jax.planning.demand import SlotCosts
 
@@ -100,9 +101,9 @@ def feasible_horizon(
         age_visits, _ = demand.age_visits(params, layout, state.age, slots)
         visits = jnp.maximum(services(slots), age_visits)
         if visits_in is not None:
-            return (visits @ visit_share <= visits_in(slots)) & jnp.all(visits <= slots)
+            return (product(visits, visit_share) <= visits_in(slots)) & jnp.all(visits <= slots)
         uav_lasts = slots * base * shortest <= state.uav_energy[0]
-        return (visits @ visit_share <= slots) & jnp.all(visits <= slots) & uav_lasts
+        return (product(visits, visit_share) <= slots) & jnp.all(visits <= slots) & uav_lasts
 
     # Bisection: if the visits fit into a number of slots, then also those for fewer slots.
     def bisect(step: Int[Array, ""], slots: Float[Array, ""]) -> Float[Array, ""]:

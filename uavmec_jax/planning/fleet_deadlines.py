@@ -17,6 +17,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num, PRNGKeyArray
 from uavmec_jax.env.dynamics import State, complete_state, initial_state, slots_to_expiry
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
+from uavmec_jax.env.products import product
 from uavmec_jax.planning import demand, fleet_demand
 from uavmec_jax.planning.deadlines import earliest_deadline as of_one_uav
 from uavmec_jax.planning.deadlines import feasible_horizon
@@ -130,7 +131,7 @@ def split_among(params: Params, layout: Layout, flies: Bool[Array, " K"]) -> Int
         share = (turned + 0.5 * weight) / total
         group = jnp.clip(jnp.floor(share * groups), 0, groups - 1).astype(jnp.int32)
         member = jnp.where(group == jnp.arange(flies.shape[0])[:, None], weight, 0.0)
-        centre = member @ layout.position / jnp.maximum(jnp.sum(member, axis=1, keepdims=True), 1e-6)
+        centre = product(member, layout.position) / jnp.maximum(jnp.sum(member, axis=1, keepdims=True), 1e-6)
         return jnp.sum(weight * jnp.sum((layout.position - centre[group]) ** 2, axis=1)), group
 
     spread, group = jax.lax.map(sweep, jnp.arange(layout.n_devices))

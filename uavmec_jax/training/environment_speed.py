@@ -52,6 +52,7 @@ def environment_speed(
     keys = jax.random.split(jax.random.key(0), n_layouts)
     scenarios = jax.vmap(lambda key: _random_scenario(key, devices, uavs, depot))(keys)
     states = jax.vmap(lambda s: initial_state(s.params, s.layout))(scenarios)
+    states = jax.tree.map(jnp.copy, states)  # full batteries share the layouts' memory, and `states` will be donated
     split = PartitionSpec("layouts")
     play = jax.jit(
         jax.shard_map(
