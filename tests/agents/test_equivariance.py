@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from tests.populations import take
 from tests.small_scenarios import mid_life
 from uavmec_jax.agents import ppo
-from uavmec_jax.agents.networks import ABSENT_LOGIT, sum_over_devices
+from uavmec_jax.agents.equivariant_networks import ABSENT_LOGIT, sum_over_devices
 from uavmec_jax.agents.observation_spec import OBSERVATIONS
 from uavmec_jax.env.layout import pad_layout
 from uavmec_jax.planning.observation import FEATURES, observe_devices

@@ -18,16 +18,16 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from uavmec_jax.agents.algorithm import Agent, Algorithm
+from uavmec_jax.agents.environments import Environments, start
 from uavmec_jax.agents.networks import Weights, count_weights, scale_ages
 from uavmec_jax.agents.observation_spec import OBSERVATIONS, ObservationSpec
 from uavmec_jax.agents.optimizers import TrainState
-from uavmec_jax.env.dynamics import State, initial_state
-from uavmec_jax.env.generator import ScenarioDistribution, sample_scenario
+from uavmec_jax.env.dynamics import State
 from uavmec_jax.env.scenario import Scenario
 from uavmec_jax.env.types import Scalar
 
-_WEIGHTS_STREAM, _SCENARIOS_STREAM = 2**32 - 1, 2**32 - 2
-"""``fold_in`` numbers of the initial weights and scenarios; the iterations use their own numbers, from 0."""
+_WEIGHTS_STREAM = 2**32 - 1
+"""``fold_in`` number of the initial weights; the iterations use their own numbers, from 0."""
 
 
 @struct.dataclass
@@ -121,6 +121,16 @@ class ActorCriticState:
     scenarios: Scenario | None = None
 
     @property
+    def policy_weights(self) -> Weights:
+        """What the greedy policy is made from."""
+        return self.weights
+
+    @property
+    def environments(self) -> Environments:
+        """The environments, and their scenarios."""
+        return Environments(self.env_states, self.scenarios)
+
+    @property
     def train_state(self) -> TrainState:
         """The part that gradient steps change."""
         return TrainState(self.weights, self.opt_state, self.diverged_at)
@@ -160,23 +170,16 @@ def make_algorithm(
 def init(spec: ActorCriticSpec, optimizer: optax.GradientTransformationExtraArgs, agent: Agent) -> ActorCriticState:
     """Return an agent's state before training: orthogonal weights, and a new episode in every environment."""
     weights = spec.network.init(jax.random.fold_in(agent.key, _WEIGHTS_STREAM), jnp.zeros((1, spec.obs_size)))
-    scenarios = None
-    if isinstance(agent.scenario, ScenarioDistribution):
-        keys = jax.random.split(jax.random.fold_in(agent.key, _SCENARIOS_STREAM), spec.n_envs)
-        scenarios = jax.vmap(partial(sample_scenario, agent.scenario))(keys)
-        env_states = jax.vmap(initial_state)(scenarios.params, scenarios.layout)
-    else:
-        env_state = initial_state(agent.scenario.params, agent.scenario.layout)
-        env_states = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (spec.n_envs, *jnp.shape(leaf))), env_state)
+    environments = start(agent, spec.n_envs)
     return ActorCriticState(
         weights=weights,
         opt_state=optimizer.init(weights),
-        env_states=env_states,
+        env_states=environments.states,
         diverged_at=jnp.int32(-1),
         episode_slots=jnp.int32(0),
         episodes=jnp.int32(0),
         loss=jnp.float32(0),
-        scenarios=scenarios,
+        scenarios=environments.scenarios,
     )
 
 

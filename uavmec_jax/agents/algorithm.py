@@ -40,16 +40,20 @@ class AlgorithmState(Protocol):
     """The part of an algorithm's state that the population reads. Every algorithm's state has it.
 
     Attributes:
-        weights: what the greedy policy is made from.
+        policy_weights: what the greedy policy is made from.
         diverged_at: environment step at which the agent was frozen, -1 if it has not diverged.
         episode_slots: total length of the training episodes that ended in the last call of ``update``, slots.
         episodes: number of these episodes.
     """
 
-    weights: Weights
     diverged_at: Int[Array, "*batch"]
     episode_slots: Int[Array, "*batch"]
     episodes: Int[Array, "*batch"]
+
+    @property
+    def policy_weights(self) -> Weights:
+        """What the greedy policy is made from."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)

@@ -136,6 +136,11 @@ class DQNState:
     episodes: Int[Array, "*batch"]
     loss: Float[Array, "*batch"]
 
+    @property
+    def policy_weights(self) -> Weights:
+        """What the greedy policy is made from."""
+        return self.weights
+
 
 def algorithm(spec: DQNSpec) -> Algorithm:
     """Return the algorithm with its static settings bound.

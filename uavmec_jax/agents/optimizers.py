@@ -101,6 +101,11 @@ def clipped_rmsprop(decay: float = 0.99, eps: float = 1e-5) -> optax.GradientTra
     return optax.GradientTransformationExtraArgs(init, update)
 
 
+def linear_decay(initial: Scalar, final_share: Scalar, progress: Scalar) -> Scalar:
+    """Return a value that falls linearly from ``initial``, at progress 0, to ``final_share`` of it, at progress 1."""
+    return initial * (1.0 - progress * (1.0 - final_share))
+
+
 @struct.dataclass
 class TrainState:
     """The part of an agent's state that gradient steps change.

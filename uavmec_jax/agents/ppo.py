@@ -16,6 +16,7 @@ from uavmec_jax.agents.collect_rollout import Samples, collect_rollout
 from uavmec_jax.agents.gae import log_prob_and_entropy, normalize
 from uavmec_jax.agents.networks import Weights
 from uavmec_jax.agents.optimizers import TrainState, apply_gradients, clipped_adam
+from uavmec_jax.agents.shuffle import permutation
 from uavmec_jax.env.types import Scalar
 
 _OPTIMIZER = clipped_adam(eps=1e-5)
@@ -86,7 +87,7 @@ def _iteration(spec: PPOSpec, agent: Agent, state: ActorCriticState, i: Int[Arra
         carry: tuple[TrainState, Array], numbered: tuple[Array, PRNGKeyArray]
     ) -> tuple[tuple[TrainState, Array], None]:
         number, key = numbered
-        shuffled = rows[_permutation(key, rows.shape[0])]
+        shuffled = rows[permutation(key, rows.shape[0])]
         count = updates_done + number * spec.minibatches + 1
         return train_epoch(spec, hyper, carry[0], shuffled, count, steps_done), None
 
@@ -133,14 +134,6 @@ def train_epoch(
         return (train_state, loss), None
 
     return jax.lax.scan(gradient_step, (train_state, jnp.float32(0)), (jnp.arange(spec.minibatches), batches))[0]
-
-
-def _permutation(key: PRNGKeyArray, size: int) -> Int[Array, " size"]:
-    """Draw a random order: the ranks of random words.
-
-    Two equal words, which occur once in about 2,000 orders of 2,048 elements, keep their order.
-    """
-    return jax.lax.sort_key_val(jax.random.bits(key, (size,)), jnp.arange(size))[1]
 
 
 def _rows(samples: Samples) -> Float[Array, "size row"]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
-from uavmec_jax.agents import a2c, dqn, ppo
+from uavmec_jax.agents import a2c, dqn, ppo, pqn
 from uavmec_jax.agents.algorithm import Algorithm
 
 SCENARIO_SETTINGS = ("total_steps", "n_devices", "max_age")
@@ -67,6 +67,7 @@ class RegisteredAlgorithm:
 ALGORITHMS: Mapping[str, RegisteredAlgorithm] = MappingProxyType(
     {
         "dqn": RegisteredAlgorithm(dqn.DQNHyper, dqn.DQNSpec, dqn.algorithm),
+        "pqn": RegisteredAlgorithm(pqn.PQNHyper, pqn.PQNSpec, pqn.algorithm),
         "ppo": RegisteredAlgorithm(ppo.PPOHyper, ppo.PPOSpec, ppo.algorithm),
         "a2c": RegisteredAlgorithm(a2c.A2CHyper, a2c.A2CSpec, a2c.algorithm),
     }

@@ -34,15 +34,15 @@ def random(params: Params, layout: Layout, state: State, key: PRNGKeyArray | Non
     """
     if key is None:
         raise ValueError("the random policy needs a key")
-    return _nth_device(layout, lambda count: jax.random.randint(key, (), 0, count, jnp.int32))
+    return nth_device(layout, lambda count: jax.random.randint(key, (), 0, count, jnp.int32))
 
 
 def round_robin(params: Params, layout: Layout, state: State, key: PRNGKeyArray | None = None) -> Array:
     """Visit the devices in the order of their indices, over and over."""
-    return _nth_device(layout, lambda count: state.slot % count)
+    return nth_device(layout, lambda count: state.slot % count)
 
 
-def _nth_device(layout: Layout, number: Callable[[int | Int[Array, ""]], Int[Array, ""]]) -> Int[Array, ""]:
+def nth_device(layout: Layout, number: Callable[[int | Int[Array, ""]], Int[Array, ""]]) -> Int[Array, ""]:
     """Return the index of device ``number(count)`` among the ``count`` devices; padding is not counted."""
     if layout.present is None:
         return number(layout.capacity.shape[0])

@@ -33,6 +33,7 @@ def _algorithm_settings(name: str) -> Any:
 
 
 DQNSettings: Any = _algorithm_settings("dqn")
+PQNSettings: Any = _algorithm_settings("pqn")
 PPOSettings: Any = _algorithm_settings("ppo")
 A2CSettings: Any = _algorithm_settings("a2c")
 
@@ -111,6 +112,7 @@ class Study(StrictModel):
     """``powered`` and ``connected``, or ``cells`` (pairs of the two); ``seeds`` (a number or a list); ``algorithm``,
     ``reward``, ``guard``, ``place``, ``traffic_bonus``, ``traffic_penalty``, ``uavs``, ``depots``, or any traced setting."""
     dqn: DQNSettings = DQNSettings()
+    pqn: PQNSettings = PQNSettings()
     ppo: PPOSettings = PPOSettings()
     a2c: A2CSettings = A2CSettings()
     params: ParamsSettings = ParamsSettings()

@@ -78,13 +78,13 @@ class Programs:
         state = jax.tree.map(struct_of, jax.eval_shape(init, agents))
         batch = sharding.shard_shape((keys.shape[0],))[0] * mesh.size
         vector: Any = partial(jax.ShapeDtypeStruct, (batch,), sharding=sharding)
-        best = Best(weights=state.weights, score=vector(np.float32), step=vector(np.int32))
+        best = Best(weights=state.policy_weights, score=vector(np.float32), step=vector(np.int32))
         update = over_agents(algorithm.update, 2, 2, donate_argnums=1, compiler_options=_compiler_options())
         validate = over_agents(partial(_validate, algorithm), 4, 1, donate_argnums=3)
         return cls(
             init=init.lower(agents).compile(),
             update=update.lower(agents, state, 0, 1).compile(),
-            validate=validate.lower(agents, keys, state.weights, best, 0).compile(),
+            validate=validate.lower(agents, keys, state.policy_weights, best, 0).compile(),
         )
 
 
@@ -97,7 +97,7 @@ def initial_best(state: AlgorithmState) -> Best:
     """Return the best weights before the first validation: those of ``state``, with a score that every other exceeds."""
     size, sharding = state.diverged_at.shape[0], state.diverged_at.sharding
     return Best(
-        weights=jax.tree.map(jnp.copy, state.weights),
+        weights=jax.tree.map(jnp.copy, state.policy_weights),
         score=jax.device_put(jnp.full((size,), -jnp.inf), sharding),
         step=jax.device_put(jnp.zeros((size,), jnp.int32), sharding),
     )

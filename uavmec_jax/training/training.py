@@ -208,7 +208,7 @@ class Training:
         tick, scores, step = time.perf_counter(), [], np.int32(self.steps)
         for batch in self.group_batches:
             score, batch.best = self.trainer.programs.validate(
-                batch.agents, batch.keys, batch.state.weights, batch.best, step
+                batch.agents, batch.keys, batch.state.policy_weights, batch.best, step
             )
             scores.append(score)
         self.scores.append(_concatenate(scores))
@@ -267,7 +267,7 @@ class Training:
         """Return the ``best`` and the ``last`` weights so far of the first ``n_agents`` agents, on the host."""
         return {
             "best": _gather([batch.best.weights for batch in self.group_batches], n_agents),
-            "last": _gather([batch.state.weights for batch in self.group_batches], n_agents),
+            "last": _gather([batch.state.policy_weights for batch in self.group_batches], n_agents),
         }
 
     def result(self, n_agents: int) -> TrainedShard:
