@@ -24,7 +24,7 @@ from uavmec_jax.studies.study import load_study
 from uavmec_jax.training import host
 from uavmec_jax.training.environment_speed import environment_speed
 
-PARTS = ("environment", "fleet", "training", "on_policy", "profile", "table5")
+PARTS = ("environment", "fleet", "training", "rollouts", "profile", "table5")
 """What is measured, in this order."""
 POPULATIONS = (75, 750, 7500)
 """Numbers of agents that train together."""
@@ -53,23 +53,23 @@ def measure_fleet(quick: bool, seconds: float) -> list[dict]:
     return rows
 
 
-def measure_training(quick: bool, seconds: float) -> list[dict]:
+def measure_training(populations: tuple[int, ...], seconds: float) -> list[dict]:
     """Measure the DQN's training."""
     rows = []
-    for agents in (2,) if quick else POPULATIONS:
+    for agents in populations:
         rows.append(dqn_speed(agents, seconds, filled=FILLED.get(agents, 4_000)))
         print(f"dqn, {agents:>17,} agents: {rows[-1]['steps_per_second']:>14,.0f} steps/s", flush=True)
     return rows
 
 
-def measure_on_policy(quick: bool, seconds: float) -> list[dict]:
-    """Measure PPO's training with one and with 64 environments per agent."""
+def measure_rollouts(quick: bool, seconds: float) -> list[dict]:
+    """Measure the training of PQN and PPO, with 64 environments per agent and 32 slots between updates."""
     rows = []
-    for agents, n_envs in ((2, 1),) if quick else ((75, 1), (75, 64), (750, 64)):
-        changes = {} if n_envs == 1 else {"ppo.n_steps": 32}
-        rows.append(on_policy_speed("ppo", agents, seconds, n_envs, changes))
-        speed = rows[-1]["steps_per_second"]
-        print(f"ppo, {agents:>7,} agents x {n_envs:>2} environments: {speed:>12,.0f} steps/s", flush=True)
+    for algorithm in ("pqn", "ppo"):
+        for agents in (2,) if quick else (75, 750):
+            rows.append(on_policy_speed(algorithm, agents, seconds, 64, {f"{algorithm}.n_steps": 32}))
+            speed = rows[-1]["steps_per_second"]
+            print(f"{algorithm}, {agents:>7,} agents x 64 environments: {speed:>12,.0f} steps/s", flush=True)
     return rows
 
 
@@ -91,6 +91,7 @@ def main() -> None:
     parser.add_argument(
         "--parts", nargs="+", choices=PARTS, default=PARTS, help="what to measure; by default all of it"
     )
+    parser.add_argument("--agents", nargs="+", type=int, default=POPULATIONS, help="sizes of the DQN's populations")
     parser.add_argument("--quick", action="store_true", help="small sizes: a test of the script")
     arguments = parser.parse_args()
     host.use_all_cores()
@@ -103,8 +104,8 @@ def main() -> None:
     measures = {
         "environment": lambda: measure_environment(quick, seconds),
         "fleet": lambda: measure_fleet(quick, seconds),
-        "training": lambda: measure_training(quick, seconds),
-        "on_policy": lambda: measure_on_policy(quick, seconds),
+        "training": lambda: measure_training((2,) if quick else tuple(arguments.agents), seconds),
+        "rollouts": lambda: measure_rollouts(quick, seconds),
         "profile": lambda: None if jax.default_backend() == "cpu" else profile_training(),
         "table5": lambda: measure_table5(quick, arguments.out / "table5"),
     }

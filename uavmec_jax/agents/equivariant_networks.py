@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from uavmec_jax.agents.networks import OrthogonalDense, orthogonal
+from uavmec_jax.agents.networks import LayerNorm, OrthogonalDense, orthogonal
 from uavmec_jax.env.fixed_point import order_independent_sum
 
 
@@ -59,7 +59,7 @@ class EquivariantNetwork(nn.Module):
         """Declare the layers."""
         gain, width = math.sqrt(2.0), self.hidden[-1]
         self.encoder = [OrthogonalDense(size, gain, name=f"looks_{k}") for k, size in enumerate(self.hidden)]
-        self.norms = [nn.LayerNorm() for _ in self.hidden] if self.layer_norm else []
+        self.norms = [LayerNorm() for _ in self.hidden] if self.layer_norm else []
         self.policy_device = OrthogonalDense(width, gain, name="own")
         self.policy_pooled = OrthogonalDense(width, gain, name="others")
         self.policy_head = RowScore(0.01, name="score")

@@ -15,6 +15,10 @@ Weights = Any
 """Parameters of a network, or their gradient: nested dictionaries of arrays, leaves ``[*batch, ...]``."""
 
 
+_NORM_EPS = 1e-6
+"""Added to the variance in a layer normalisation."""
+
+
 @jax.custom_vjp
 def matmul(x: Float[Array, "... i"], w: Float[Array, "i o"]) -> Float[Array, "... o"]:
     """Return ``x @ w``. On a CPU the backward pass transposes its operands in memory first.
@@ -90,6 +94,46 @@ class OrthogonalDense(nn.Module):
         return matmul(x, kernel) + self.param("bias", nn.initializers.zeros, (self.features,))
 
 
+@jax.custom_vjp
+def normalize_layer(
+    x: Float[Array, "... f"], scale: Float[Array, " f"], bias: Float[Array, " f"]
+) -> Float[Array, "... f"]:
+    """Normalise each row to mean 0 and variance 1, then scale and shift it (Ba et al., 2016, equation 3).
+
+    The gradient is written out, which takes a third fewer passes over the rows than that of automatic differentiation.
+    """
+    return _normalize_forward(x, scale, bias)[0]
+
+
+def _normalize_forward(x: Array, scale: Array, bias: Array) -> tuple[Array, tuple[Array, Array, Array]]:
+    centered = x - jnp.mean(x, axis=-1, keepdims=True)
+    inverse = jax.lax.rsqrt(jnp.mean(jnp.square(centered), axis=-1, keepdims=True) + _NORM_EPS)
+    normalized = centered * inverse
+    return normalized * scale + bias, (normalized, inverse, scale)
+
+
+def _normalize_backward(residuals: tuple[Array, Array, Array], gradient: Array) -> tuple[Array, Array, Array]:
+    normalized, inverse, scale = residuals
+    rows = tuple(range(gradient.ndim - 1))
+    scaled = gradient * scale
+    along = jnp.mean(scaled * normalized, axis=-1, keepdims=True)
+    dx = inverse * (scaled - jnp.mean(scaled, axis=-1, keepdims=True) - normalized * along)
+    return dx, jnp.sum(gradient * normalized, axis=rows), jnp.sum(gradient, axis=rows)
+
+
+normalize_layer.defvjp(_normalize_forward, _normalize_backward)
+
+
+class LayerNorm(nn.Module):
+    """Layer normalisation with a learned scale and shift."""
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "... f"]) -> Float[Array, "... f"]:
+        """Apply the layer to ``[..., f]``."""
+        scale = self.param("scale", nn.initializers.ones, (x.shape[-1],))
+        return normalize_layer(x, scale, self.param("bias", nn.initializers.zeros, (x.shape[-1],)))
+
+
 class QNetwork(nn.Module):
     """The paper's Q-network: ReLU layers, then one value per action.
 
@@ -111,7 +155,7 @@ class QNetwork(nn.Module):
         x = observation
         for width in self.hidden:
             x = TorchDense(width)(x)
-            x = nn.relu(nn.LayerNorm()(x) if self.layer_norm else x)
+            x = nn.relu(LayerNorm()(x) if self.layer_norm else x)
         values = TorchDense(self.n_actions)(x)
         if self.dueling:
             values = TorchDense(1)(x) + values - jnp.mean(values, axis=-1, keepdims=True)

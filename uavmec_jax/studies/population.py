@@ -166,7 +166,8 @@ def _stack_rewards(rewards: list[Reward]) -> Reward:
     """Return rewards as one, leaves ``[A, ...]``; where only some have the term of service, the others weigh it by 0."""
     if any(reward.service is not None for reward in rewards):
         rewards = [replace(reward, service=jnp.float32(reward.service or 0.0)) for reward in rewards]
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *rewards)
+    # stacked on the host: a program with one operand per agent takes minutes to compile
+    return jax.tree.map(lambda *leaves: jnp.asarray(np.stack([np.asarray(leaf) for leaf in leaves])), *rewards)
 
 
 def _add_fleets(layouts: Layout, params: Params, study: Study) -> Layout:
