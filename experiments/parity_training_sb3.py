@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from reports import write_report
+from sb3_quality import lifetimes_of
 
 DRAWS = 64
 """Volume draws of the evaluation."""
@@ -29,37 +30,22 @@ MAX_SLOTS = 64
 def sb3_worker(seeds: list[int], steps: int) -> None:
     """Train with Stable-Baselines3, and print the mean lifetime of each seed's greedy policy."""
     os.environ["JAX_PLATFORMS"] = "cpu"
-    import jax
-    import numpy as np
     import torch
     from stable_baselines3 import DQN
 
-    from uavmec_jax.env.dynamics import Cause, initial_state, transition
-    from uavmec_jax.env.observation import observe
-    from uavmec_jax.env.rollout import volume_table
     from uavmec_jax.env.scenario import make_scenario
     from uavmec_jax.interop.gymnasium_env import UavMecGymEnv
 
     torch.set_num_threads(1)
     scenario = make_scenario(make_layout())
-    params, layout = scenario.params, scenario.layout
-    volumes = np.asarray(jax.vmap(lambda key: volume_table(params, 12, key, MAX_SLOTS))(evaluation_draws()))
-    start = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (DRAWS, *np.shape(leaf))), initial_state(params, layout))
-    step = jax.jit(jax.vmap(lambda state, action, volumes: transition(params, layout, state, action, volumes)))
     for seed in seeds:
         model = DQN(
             "MlpPolicy", UavMecGymEnv(scenario), learning_rate=0.0071, batch_size=16, gamma=0.98, buffer_size=steps,
             exploration_fraction=0.35, policy_kwargs={"net_arch": [64, 64]}, device="cpu", seed=seed,
         )  # fmt: skip
         model.learn(steps)
-        state, length = start, np.zeros(DRAWS, int)
-        for slot in range(MAX_SLOTS):
-            observation = np.asarray(jax.vmap(observe, (None, None, 0))(params, layout, state))
-            action, _ = model.predict(observation, deterministic=True)
-            state, outcome = step(state, action, volumes[:, slot])
-            length = np.where(length > 0, length, np.where(np.asarray(outcome.cause) != Cause.NONE, slot + 1, 0))
-        assert (length > 0).all()
-        print(json.dumps({"seed": seed, "lifetime": float(length.mean())}), flush=True)
+        lifetime = float(lifetimes_of(model, scenario, evaluation_draws()).mean())
+        print(json.dumps({"seed": seed, "lifetime": lifetime}), flush=True)
 
 
 def make_layout() -> Any:

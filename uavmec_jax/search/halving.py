@@ -101,7 +101,7 @@ class SuccessiveHalving:
         rungs: list[dict[int, float]] = [{} for _ in trials]
         for chunk in self._rungs(trainer):
             self._train_until(trainings, chunk, len(remaining))
-            scores = self._trial_means(np.concatenate([training.best_scores for training in trainings]), len(remaining))
+            scores = self._trial_means(np.concatenate([self._scores(one) for one in trainings]), len(remaining))
             for trial, score in zip(remaining, scores, strict=True):
                 rungs[trial][trainings[0].steps] = float(score)
             if chunk < len(trainer.chunks):
@@ -187,6 +187,10 @@ class SuccessiveHalving:
         """Return each trial's mean over its scenarios, from one value per agent."""
         return values[: trials * self.n_scenarios].reshape(trials, self.n_scenarios).mean(axis=1)
 
+    def _scores(self, training: Training) -> Float[np.ndarray, " padded"]:
+        """Return the validation scores by which trials are compared: the best so far, or the last ones."""
+        return training.best_scores if self.space.weights == "best" else training.scores[-1]
+
     def _members(self, trials: Sequence[int] | np.ndarray) -> Int[np.ndarray, " members"]:
         """Return the indices of the agents of some trials in the population."""
         return (np.asarray(trials)[:, None] * self.n_scenarios + np.arange(self.n_scenarios)).ravel()
@@ -196,9 +200,9 @@ class SuccessiveHalving:
         n, size = agents.key.shape[0], trainings[0].trainer.partition.shard_size
         keys = evaluation_keys(self.study, self.agent_ids * (n // self.n_scenarios))
         sizes = [min(size, n - k * size) for k in range(len(trainings))]
-        pieces = [training.weights(size)["best"] for training, size in zip(trainings, sizes, strict=True)]
-        best = jax.tree.map(lambda *leaves: np.concatenate(leaves), *pieces)
-        lifetimes = evaluate_learned(algorithm, agents, keys, {"best": best})["best"].mean_lifetime
+        pieces = [training.weights(size)[self.space.weights] for training, size in zip(trainings, sizes, strict=True)]
+        weights = jax.tree.map(lambda *leaves: np.concatenate(leaves), *pieces)
+        lifetimes = evaluate_learned(algorithm, agents, keys, {"searched": weights})["searched"].mean_lifetime
         per_trial = lifetimes.reshape(-1, self.n_scenarios)
         if self.space.objective == "mean":
             return [float(mean) for mean in per_trial.mean(axis=1)]

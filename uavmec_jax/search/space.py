@@ -72,7 +72,9 @@ class Space(StrictModel):
     batch: Annotated[int, Field(ge=1, le=4096)] = 16
     """Number of trials that train together."""
     objective: Literal["mean", "low"] = "mean"
-    """The objective: mean lifetime of the best weights, or the lower end of its 95 % interval over the scenarios."""
+    """The objective: mean lifetime of the weights, or the lower end of its 95 % interval over the scenarios."""
+    weights: Literal["best", "last"] = "best"
+    """Which weights of a trial are evaluated: those with the best validation score, or the last ones."""
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
     validation: ValidationScenarios = ValidationScenarios()
     halving: Halving = Halving()

@@ -1,0 +1,114 @@
+"""What each piece of the best Q-learner is worth: `table5-best` with one setting changed at a time.
+
+    uv run python experiments/q_ablation.py [--runs runs/ablation] [--out results/table5-best]
+
+Every variant trains on the same 50 layouts, two in each of the 25 cells, that neither the search nor Table 5 has used, with
+the same draws. Lifetimes are shares of the upper bound on these draws. Runs that are finished are not repeated. Writes
+`ablation.csv` and prints it.
+"""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from rich.console import Console
+from rich.table import Table
+
+from uavmec_jax.runs.run import run_or_resume
+from uavmec_jax.studies.results import Results
+from uavmec_jax.studies.statistics import mean_interval
+from uavmec_jax.studies.study import load_study
+from uavmec_jax.training import host
+
+SEEDS = [2_000_000, 2_000_001]
+CELL = ["powered", "connected"]
+VARIANTS: dict[str, dict[str, Any]] = {
+    "the study": {},
+    "guide: oldest-first": {"pqn.guide": "oldest-first"},
+    "guide: none": {"pqn.guide": "none"},
+    "half of the exploration guided": {"pqn.guidance": 0.5},
+    "no gap": {"pqn.gap": 0.0},
+    "no gap, no guide": {"pqn.gap": 0.0, "pqn.guide": "none"},
+    "one epsilon for all environments": {"pqn.exploration_highest_eps": 0.1, "pqn.exploration_lowest_eps": 0.1},
+    "no layer norm": {"pqn.layer_norm": False},
+    "one-step targets": {"pqn.q_lambda": 0.0},
+    "no cut at exploratory actions": {"pqn.cut_traces": False},
+    "constant learning rate": {"pqn.learning_rate_final": 1.0},
+    "constant learning rate, no average": {"pqn.learning_rate_final": 1.0, "pqn.average_weights": False},
+    "no average": {"pqn.average_weights": False},
+    "gamma 0.98": {"pqn.gamma": 0.98},
+    "ages not scaled": {"pqn.age_scale": 1.0},
+    "four epochs, half the steps": {"pqn.n_epochs": 4, "steps": 300_000},
+    "one epoch, twice the steps": {"pqn.n_epochs": 1, "steps": 1_200_000},
+    "128-128": {"pqn.hidden": [128, 128]},
+    "half the steps": {"steps": 300_000},
+    "a quarter of the steps": {"steps": 150_000},
+    "reward of the paper": {"reward": "U+log(A/O)", "slot_reward": 0.0, "pqn.gamma": 0.98},
+}
+"""Variants of the study, by name: what they change."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=Path, default=Path("runs/ablation"), help="folder of the runs")
+    parser.add_argument("--steps", type=int, help="of every variant, for a test of the script")
+    parser.add_argument("--variants", nargs="+", choices=list(VARIANTS), default=list(VARIANTS))
+    parser.add_argument("--out", type=Path, default=Path("results/table5-best"))
+    arguments = parser.parse_args()
+    host.use_all_cores()
+
+    bound = run(arguments, "bound", {"algorithm": "none", "pqn": None, "evaluation.planners": ["bound"]}).agents
+    rows = []
+    for name in arguments.variants:
+        changes = VARIANTS[name] | {"evaluation.planners": []}
+        results = run(arguments, name.replace(":", "").replace(",", "").replace(" ", "-"), changes)
+        rows.append({"variant": name, **summarize(results, bound)})
+        print(f"{name}: {rows[-1]}", flush=True)
+    table = pd.DataFrame(rows)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    table.to_csv(arguments.out / "ablation.csv", index=False, float_format="%.5g")
+    Console(width=120).print(as_rich(table))
+
+
+def run(arguments: argparse.Namespace, name: str, changes: dict[str, Any]) -> Results:
+    """Run the study with some changes, or go on with its run."""
+    draws = {"axes.seeds": SEEDS, "evaluation.draws": 20, "evaluation.planner_draws": 20}
+    if arguments.steps:
+        changes = changes | {"steps": arguments.steps}
+    changes = {key: value for key, value in changes.items() if value is not None}
+    study = load_study("table5-best", changes | draws)
+    return run_or_resume(study, arguments.runs / name, command="uv run python experiments/q_ablation.py")
+
+
+def summarize(results: Results, bound: pd.DataFrame) -> dict[str, float]:
+    """Return shares of the bound, %: mean with its 95 % interval over the layouts, worst cell, and seconds per agent."""
+    identity = [*CELL, "seed"]
+    agents = results.agents.set_index(identity)
+    bounds = bound.set_index(identity)["bound_planned"].reindex(agents.index)
+    cells = agents.groupby(level=CELL)["last_lifetime"].mean() / bounds.groupby(level=CELL).mean()
+    mean, low, high = mean_interval((agents["last_lifetime"] / bounds).to_numpy())
+    return {
+        "best": 100 * agents["best_lifetime"].mean() / bounds.mean(),
+        "last": 100 * agents["last_lifetime"].mean() / bounds.mean(),
+        "last_low": 100 * agents["last_lifetime"].mean() / bounds.mean() - 100 * (mean - low),
+        "last_high": 100 * agents["last_lifetime"].mean() / bounds.mean() + 100 * (high - mean),
+        "worst_cell": 100 * cells.min(),
+        "seconds_per_agent": results.run["seconds"]["train"] / len(agents),
+    }
+
+
+def as_rich(table: pd.DataFrame) -> Table:
+    """Return the ablation as a table."""
+    rich = Table(title="Shares of the upper bound, %", title_justify="left")
+    for column in ("variant", "best", "last", "95 % interval", "worst cell", "s per agent"):
+        rich.add_column(column, justify="left" if column == "variant" else "right")
+    for row in table.itertuples():
+        interval = f"{row.last_low:.1f} to {row.last_high:.1f}"
+        numbers = (f"{row.best:.1f}", f"{row.last:.1f}", interval, f"{row.worst_cell:.1f}")
+        rich.add_row(str(row.variant), *numbers, f"{row.seconds_per_agent:.2f}")
+    return rich
+
+
+if __name__ == "__main__":
+    main()
