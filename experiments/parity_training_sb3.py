@@ -23,8 +23,6 @@ from sb3_quality import lifetimes_of
 
 DRAWS = 64
 """Volume draws of the evaluation."""
-MAX_SLOTS = 64
-"""Longer than any lifetime."""
 
 
 def sb3_worker(seeds: list[int], steps: int) -> None:
