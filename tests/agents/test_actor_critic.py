@@ -1,4 +1,7 @@
-"""PPO and A2C: rollouts, independence of agents, divergence, learning. test_parity.py compares their updates with SB3's."""
+"""PPO and A2C: rollouts, independence of agents, divergence, learning. test_parity.py compares their updates with SB3's.
+
+Independence and divergence are tested for PQN, too; its other tests are in test_pqn.py.
+"""
 
 import functools
 
@@ -11,7 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 
 from tests.populations import differs, make_agent, over_agents, stack, take
-from uavmec_jax.agents import a2c, actor_critic, gae, ppo
+from uavmec_jax.agents import a2c, actor_critic, gae, ppo, pqn
 from uavmec_jax.agents.collect_rollout import collect_rollout
 from uavmec_jax.env.dynamics import initial_state
 from uavmec_jax.env.observation import observe
@@ -19,8 +22,8 @@ from uavmec_jax.env.params import Params
 
 A2C = a2c.algorithm(a2c.A2CSpec(total_steps=10_000))
 PPO = ppo.algorithm(ppo.PPOSpec(total_steps=10_000, n_steps=64, batch_size=16, n_epochs=2))
-BOTH = ["a2c", pytest.param("ppo", marks=pytest.mark.slow)]
-ALGORITHMS = {"a2c": (A2C, a2c.A2CHyper), "ppo": (PPO, ppo.PPOHyper)}
+PQN = pqn.algorithm(pqn.PQNSpec(total_steps=10_000, hidden=(16,), n_envs=4, n_steps=16, batch_size=16, n_epochs=2))
+ALGORITHMS = {"a2c": (A2C, a2c.A2CHyper), "ppo": (PPO, ppo.PPOHyper), "pqn": (PQN, pqn.PQNHyper)}
 
 
 @functools.cache
@@ -93,7 +96,7 @@ def test_a_cut_off_episode_is_bootstrapped():
 
 @pytest.mark.slow
 @pytest.mark.bits
-@pytest.mark.parametrize("name", BOTH)
+@pytest.mark.parametrize("name", ALGORITHMS)
 def test_an_agent_does_not_depend_on_the_others(name):
     agents = population(name, {}, {"gamma": 0.9}, {"learning_rate": 1e-3})
     state, again = train(name, agents, 0, 12), train(name, agents, 0, 12)
@@ -106,7 +109,17 @@ def test_an_agent_does_not_depend_on_the_others(name):
     assert any(differs(take(state, 1), take(mixed, 1)))
 
 
-@pytest.mark.parametrize("name", BOTH)
+@pytest.mark.slow
+@pytest.mark.bits
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_an_agent_does_not_depend_on_its_place(name):
+    agents = population(name, {}, {"gamma": 0.9}, {"learning_rate": 1e-3})
+    order = np.array([2, 0, 1])
+    moved = train(name, take(agents, order), 0, 12)
+    chex.assert_trees_all_equal(take(train(name, agents, 0, 12), order), moved)
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
 @pytest.mark.slow
 @pytest.mark.parametrize("bad", [{"learning_rate": np.inf}, {"gamma": np.nan}])
 def test_diverged_agent_is_frozen_and_does_not_affect_the_others(name, bad):
@@ -140,7 +153,7 @@ def test_greedy_action_takes_any_batch_of_observations():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ALGORITHMS)
+@pytest.mark.parametrize("name", ["a2c", "ppo"])
 def test_learns_to_visit_the_oldest(name):
     """On a layout where only data age matters, episodes are much longer after a hundred thousand steps."""
     hyper_class = ALGORITHMS[name][1]

@@ -11,13 +11,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from tests.populations import take
 from tests.small_scenarios import mid_life
-from uavmec_jax.agents import ppo
+from uavmec_jax.agents import ppo, pqn
 from uavmec_jax.agents.equivariant_networks import ABSENT_LOGIT, sum_over_devices
 from uavmec_jax.agents.observation_spec import OBSERVATIONS
 from uavmec_jax.env.layout import pad_layout
 from uavmec_jax.planning.observation import FEATURES, observe_devices
 
 SPEC = ppo.PPOSpec(hidden=(16, 24), observation="full", n_envs=4, n_steps=8, batch_size=16)
+Q_SPEC = pqn.PQNSpec(hidden=(16, 24), observation="full")
 
 
 @functools.cache
@@ -35,6 +36,24 @@ def apply_network(weights, params, layout, state):
     observation = OBSERVATIONS["full"].observation_fn(params, layout, state)
     logits, value = SPEC.network.apply(weights, observation[None])
     return logits[0], value[0]
+
+
+@functools.cache
+def initial_q_weights():
+    weights = Q_SPEC.network.init(jax.random.key(4), jnp.zeros((1, Q_SPEC.obs_size)))
+    score = weights["params"]["score"]  # Q-values of new weights are almost equal; these are not
+    return {"params": weights["params"] | {"score": {**score, "kernel": 100.0 * score["kernel"]}}}
+
+
+def q_values(params, layout, state):
+    """Return the Q-values of one state."""
+    return apply_q_network(initial_q_weights(), params, layout, state)
+
+
+@jax.jit
+def apply_q_network(weights, params, layout, state):
+    observation = OBSERVATIONS["full"].observation_fn(params, layout, state)
+    return Q_SPEC.network.apply(weights, observation[None])[0]
 
 
 def pad_state(state, entries):
@@ -58,6 +77,40 @@ def test_permuting_devices_permutes_the_logits_and_keeps_the_value(n):
         permuted_logits, permuted_value = logits_and_value(params, *permuted(order, layout, state))
         assert_array_equal(permuted_logits, np.asarray(logits)[order])
         assert_array_equal(permuted_value, value)
+
+
+@pytest.mark.bits
+@pytest.mark.parametrize("n", [*(pytest.param(n, marks=pytest.mark.slow) for n in (2, 12, 64)), 5])
+def test_permuting_devices_permutes_the_q_values(n):
+    rng = np.random.default_rng(n)
+    for seed in range(6):
+        params, layout, state = mid_life(seed, n)
+        values, order = np.asarray(q_values(params, layout, state)), rng.permutation(n)
+        assert np.ptp(values) > 0.01
+        assert_array_equal(q_values(params, *permuted(order, layout, state)), values[order])
+
+
+@pytest.mark.bits
+def test_padding_changes_no_q_value_and_may_be_anywhere():
+    params, layout, state = mid_life(2, 5)
+    values = np.asarray(q_values(params, layout, state))
+    padded = pad_layout(layout, 8), pad_state(state, 3)
+    padded_values = np.asarray(q_values(params, *padded))
+    assert_allclose(padded_values[:5], values, rtol=1e-5, atol=1e-6)
+    assert_array_equal(padded_values[5:], np.full(3, ABSENT_LOGIT, np.float32))
+    order = np.random.default_rng(0).permutation(8)
+    assert_array_equal(q_values(params, *permuted(order, *padded)), padded_values[order])
+
+
+def test_the_mean_of_the_q_values_is_the_value_of_the_state():
+    """The heads are dueling: doubling the scores doubles the distances from the mean and keeps it."""
+    params, layout, state = mid_life(2, 5)
+    padded = params, pad_layout(layout, 7), pad_state(state, 2)
+    weights = initial_q_weights()["params"]
+    doubled = weights | {"score": jax.tree.map(lambda leaf: 2.0 * leaf, weights["score"])}
+    single, double = (apply_q_network({"params": w}, *padded)[:5] for w in (weights, doubled))
+    assert_allclose(double.mean(), single.mean(), rtol=1e-4, atol=1e-4)
+    assert_allclose(double - double.mean(), 2 * (single - single.mean()), rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.populations import make_agent, over_agents, stack
-from uavmec_jax.agents import a2c, dqn, ppo
+from uavmec_jax.agents import a2c, dqn, ppo, pqn
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rewards import make_reward
 
@@ -17,10 +17,16 @@ ALGORITHMS = {
         ppo.algorithm(ppo.PPOSpec(total_steps=100, hidden=(4,), n_steps=4, batch_size=2, n_epochs=1)),
         ppo.PPOHyper,
     ),
+    "pqn": (
+        pqn.algorithm(pqn.PQNSpec(total_steps=100, hidden=(4,), n_envs=2, n_steps=4, batch_size=4, n_epochs=2)),
+        pqn.PQNHyper,
+    ),
 }
 
 
-@pytest.mark.parametrize("name", ["a2c", *(pytest.param(name, marks=pytest.mark.slow) for name in ("dqn", "ppo"))])
+@pytest.mark.parametrize(
+    "name", ["a2c", *(pytest.param(name, marks=pytest.mark.slow) for name in ("dqn", "ppo", "pqn"))]
+)
 def test_update_is_traced_once(name):
     algorithm, hyper_class = ALGORITHMS[name]
     chex.clear_trace_counter()
@@ -50,9 +56,13 @@ def test_dqn_takes_as_many_devices_as_its_replay_can_tell_apart():
 
 @pytest.mark.parametrize(
     ("make", "spec", "hyper_class"),
-    [(a2c.algorithm, a2c.A2CSpec, a2c.A2CHyper), (ppo.algorithm, ppo.PPOSpec, ppo.PPOHyper)],
+    [
+        (a2c.algorithm, a2c.A2CSpec, a2c.A2CHyper),
+        (ppo.algorithm, ppo.PPOSpec, ppo.PPOHyper),
+        (pqn.algorithm, pqn.PQNSpec, pqn.PQNHyper),
+    ],
 )
-def test_ppo_and_a2c_take_more(make, spec, hyper_class):
+def test_algorithms_without_a_replay_take_more(make, spec, hyper_class):
     algorithm = make(spec(total_steps=100, hidden=(4,), n_devices=300))
     agents = stack([make_agent(params=Params(n_devices=300), hyper_class=hyper_class)])
     state = jax.eval_shape(over_agents(algorithm.init, 0), agents)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.runs.processes import TINY, events, stop_after
+from tests.runs.processes import TINY, bits, events, stop_after
 from tests.runs.test_log import read_scalars
 from uavmec_jax.errors import StudyError
 from uavmec_jax.runs.options import RunOptions
@@ -28,6 +28,21 @@ def test_resuming_needs_the_reward_function_again(tmp_path):
     again = resume_run(tmp_path / "run", reward=survival)
     assert again.run["complete"]
     assert again.run["reward_function"].endswith("survival")
+
+
+@pytest.mark.parametrize("algorithm", ["dqn", "ppo", "pqn"])
+def test_a_stopped_run_of_any_algorithm_is_resumed_with_the_same_bits(tmp_path, algorithm):
+    settings = {"ppo": {"n_steps": 32, "batch_size": 32}, "pqn": {"n_envs": 4, "n_steps": 8, "batch_size": 16}}
+    changes = {f"{algorithm}.{name}": size for name, size in settings.get(algorithm, {}).items()}
+    changes |= {"algorithm": algorithm, "steps": 1500, "axes.powered": [8], f"{algorithm}.hidden": [8]}
+    study = parse_study(TINY, "tiny", changes)
+    run_study(study, tmp_path / "whole", command="x")
+    often = RunOptions(checkpoint_every_s=0.0)
+    results = run_study(study, tmp_path / "run", command="x", options=often, on_progress=stop_after(3))
+    assert results.run["stopped_by"] == 2
+    assert list((tmp_path / "run" / "shards" / "00000").glob("checkpoint-*.npz"))
+    assert resume_run(tmp_path / "run").run["complete"]
+    assert bits(tmp_path / "run") == bits(tmp_path / "whole")
 
 
 def test_agents_that_diverge_do_not_affect_the_others():

@@ -16,10 +16,10 @@ from uavmec_jax.studies.study import parse_study
 from uavmec_jax.training.population import Progress
 
 TOML = """
-name = "three"
+name = "four"
 steps = 640
 [axes]
-algorithm = ["dqn", "ppo", "a2c"]
+algorithm = ["dqn", "ppo", "a2c", "pqn"]
 cells = [[8, 8], [6, 6]]
 seeds = 2
 reward = ["U", "U+log(A/O)"]
@@ -32,6 +32,10 @@ n_steps = 64
 n_envs = 2
 [a2c]
 hidden = [16]
+[pqn]
+hidden = [16]
+n_envs = 4
+n_steps = 16
 [evaluation]
 draws = 3
 validate_every = 320
@@ -44,32 +48,33 @@ baselines = ["oldest-first"]
 
 @pytest.mark.slow
 def test_one_study_trains_each_algorithm_as_one_program(tmp_path):
-    study = parse_study(TOML, "three")
+    study = parse_study(TOML, "four")
     plan = plan_run(study)
-    assert plan.agents == 3 * 2 * 2 * 3  # the reward U has one guard
-    assert list(plan.partitions) == ["dqn", "ppo", "a2c"]
+    assert plan.agents == 4 * 2 * 2 * 3  # the reward U has one guard
+    assert list(plan.partitions) == ["dqn", "ppo", "a2c", "pqn"]
     reports: list[Progress] = []
     results = run_study(study, tmp_path / "run", on_progress=reports.append)
     assert results.run["complete"]
     assert [report.steps for report in reports] == sorted(report.steps for report in reports)
     assert reports[-1].steps == reports[-1].total_steps == plan.total_steps == results.run["environment_steps"]
-    assert {report.shard for report in reports} == {0, 1, 2}
-    assert results.agents["algorithm"].tolist() == ["dqn"] * 12 + ["ppo"] * 12 + ["a2c"] * 12
-    assert results.agents.groupby("algorithm")["steps"].first().to_dict() == {"dqn": 640, "ppo": 640, "a2c": 640}
+    assert {report.shard for report in reports} == {0, 1, 2, 3}
+    assert results.agents["algorithm"].tolist() == ["dqn"] * 12 + ["ppo"] * 12 + ["a2c"] * 12 + ["pqn"] * 12
+    assert results.agents.groupby("algorithm")["steps"].first().to_dict() == dict.fromkeys(plan.partitions, 640)
     # heuristics and planners have the same results for all agents of a scenario
     for column in ("oldest_first_lifetime", "rollout_planned", "bound_planned"):
         assert (results.agents.groupby(["seed", "powered", "connected"])[column].nunique() == 1).all()
     assert (results.agents["bound_planned"] >= results.agents["best_planned"]).all()
 
     again = load_results(tmp_path / "run")
-    assert list(again.curves) == ["dqn", "ppo", "a2c"]
+    assert list(again.curves) == ["dqn", "ppo", "a2c", "pqn"]
     assert again.curves["ppo"]["validation"].shape == (12, 3)  # validated after 2, 4 and 5 rollouts of 128 steps
     assert "critic" in load_weights(tmp_path / "run", algorithm="a2c")["params"]
     pd.testing.assert_frame_equal(again.cells(), results.cells(), rtol=1e-4)
 
-    text = TOML.replace('["dqn", "ppo", "a2c"]', '["ppo"]')
-    for other in ("dqn", "a2c"):
+    text = TOML.replace('["dqn", "ppo", "a2c", "pqn"]', '["ppo"]')
+    for other in ("dqn", "a2c", "pqn"):
         text = text.replace(f"[{other}]\nhidden = [16]\n", "")
+    text = text.replace("n_envs = 4\nn_steps = 16\n", "")
     alone = run_study(parse_study(text, "alone"))
     together = results.agents.query("algorithm == 'ppo'").reset_index(drop=True)
     pd.testing.assert_frame_equal(alone.agents, together)

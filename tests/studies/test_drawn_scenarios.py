@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from tests.experiments.scripts import run as run_script
 from tests.populations import stack, take
-from uavmec_jax.agents import ppo
+from uavmec_jax.agents import ppo, pqn
 from uavmec_jax.agents.algorithm import AGENTS_AXIS
 from uavmec_jax.agents.collect_rollout import collect_rollout
 from uavmec_jax.env.dynamics import initial_state
@@ -115,14 +115,20 @@ def test_bad_setting_is_refused_in_one_line(old, new, words):
     assert "\n" not in str(error.value)
 
 
+def pqn_text():
+    return TOML.replace("ppo", "pqn")
+
+
 @pytest.mark.slow
-def test_an_episode_that_ends_is_followed_by_one_in_a_fresh_scenario():
+@pytest.mark.parametrize("name", ["ppo", "pqn"])
+def test_an_episode_that_ends_is_followed_by_one_in_a_fresh_scenario(name):
     """Where an episode has ended, the layout is another one; elsewhere it stays."""
-    study = study_of()
-    agent = take(make_agents(study), 0)
-    spec = ppo.PPOSpec(hidden=(8,), observation="full", n_envs=16, n_steps=1, n_devices=6, batch_size=16)
-    state = ppo.algorithm(spec).init(agent)
-    collect = jax.jit(jax.vmap(partial(collect_rollout, spec, agent), axis_name=AGENTS_AXIS))
+    algorithm, spec_class = {"ppo": (ppo, ppo.PPOSpec), "pqn": (pqn, pqn.PQNSpec)}[name]
+    collect_samples = {"ppo": collect_rollout, "pqn": pqn.collect_samples}[name]
+    agent = take(make_agents(study_of(TOML.replace("ppo", name))), 0)
+    spec = spec_class(hidden=(8,), observation="full", n_envs=16, n_steps=1, n_devices=6, batch_size=16)
+    state = algorithm.algorithm(spec).init(agent)
+    collect = jax.jit(jax.vmap(partial(collect_samples, spec, agent), axis_name=AGENTS_AXIS))
     some_ended = False
     for number in range(16):
         after, samples = take(collect(stack([state]), jax.random.key(number)[None]), 0)
@@ -134,6 +140,20 @@ def test_an_episode_that_ends_is_followed_by_one_in_a_fresh_scenario():
         some_ended |= ended.any()
         state = after
     assert some_ended
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("observation", ["full", "paper"])
+def test_pqn_trains_on_drawn_scenarios(tmp_path, observation):
+    text = pqn_text().replace('observation = "full"', f'observation = "{observation}"')
+    results = run_study(study_of(text), tmp_path / "run")
+    assert_array_equal(results.agents["diverged_at"], -1)
+    policy = load_policy(tmp_path / "run", seed=1)
+    assert policy.algorithm == "pqn"
+    for n in (3, 12) if observation == "full" else (6,):
+        params = Params(n_devices=n)
+        layout = sample_layout(jax.random.key(n), params, 1, 1)
+        assert 0 <= int(policy(params, layout, initial_state(params, layout))) < n
 
 
 @pytest.fixture(scope="module")

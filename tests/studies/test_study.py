@@ -134,8 +134,8 @@ BAD = [
     ({"reward": "U+log(A/0)"}, "bad.toml: reward is 'U+log(A/0)', which is not a reward; did you mean 'U+log(A/O)'?"),
     ({"reward": {"Q": 1.0}}, "bad.toml: reward has the term 'Q', which is not one"),
     ({"guard": "none"}, "bad.toml: guard is 'none'; it should be 'clamp' or 'log1p'"),
-    ({"algorithm": "sarsa"}, "bad.toml: algorithm is 'sarsa'; it should be 'dqn', 'ppo', 'a2c' or 'none'"),
-    ({"axes.algorithm": ["dqn", "sarsa"]}, "bad.toml: axes.algorithm has 'sarsa'; known: dqn, ppo, a2c"),
+    ({"algorithm": "sarsa"}, "bad.toml: algorithm is 'sarsa'; it should be 'dqn', 'pqn', 'ppo', 'a2c' or 'none'"),
+    ({"axes.algorithm": ["dqn", "sarsa"]}, "bad.toml: axes.algorithm has 'sarsa'; known: dqn, pqn, ppo, a2c"),
     ({"axes.algorithm": "dqn"}, "bad.toml: axes.algorithm is 'dqn'; give a list"),
     ({"algorithm": "none", "axes.algorithm": ["dqn"]}, "bad.toml: axes.algorithm is given, but algorithm is 'none'"),
     ({"dqn.clip_range": 0.1}, "bad.toml: dqn.clip_range is not a setting; "),
@@ -151,6 +151,14 @@ BAD = [
     (
         {"algorithm": "ppo", "ppo.batch_size": 100},
         "bad.toml: ppo.batch_size is 100; it should divide n_steps * n_envs = 2048",
+    ),
+    (
+        {"algorithm": "pqn", "pqn.batch_size": 100},
+        "bad.toml: pqn.batch_size is 100; it should divide n_steps * n_envs = 2048",
+    ),
+    (
+        {"algorithm": "pqn", "pqn.guide": "newest-first"},
+        "bad.toml: pqn.guide is 'newest-first'; it should be 'none', 'round-robin', 'oldest-first'",
     ),
     ({"algorithm": "a2c", "a2c.gae_lambda": 1.5}, "bad.toml: a2c.gae_lambda is 1.5; it should be less than or equal"),
     ({"dqn.n_step": 0}, "bad.toml: dqn.n_step is 0; it should be greater than or equal to 1"),

@@ -19,7 +19,9 @@ from uavmec_jax.studies.population import make_agents, make_algorithm, validatio
 from uavmec_jax.training.partition import Partition
 from uavmec_jax.training.population import train_population
 
-changes = {"axes.seeds": 2, "axes.powered": [12, 8], "axes.connected": [8, 4], "steps": 1200}
+changes = {"axes.seeds": 2, "axes.powered": [12, 8], "axes.connected": [8, 4], "steps": 1200, "algorithm": sys.argv[2]}
+if sys.argv[2] == "pqn":
+    changes |= {"pqn.n_envs": 4, "pqn.n_steps": 16, "pqn.batch_size": 16}
 study = um.load_study("table5", changes)
 partition = Partition(shards=1, shard_size=8, groups=4, shard_bytes=0)
 assert partition.devices == int(sys.argv[1])
@@ -34,10 +36,13 @@ print(hashlib.sha256(b"".join(np.ascontiguousarray(leaf).tobytes() for leaf in l
 
 @pytest.mark.slow
 @pytest.mark.bits
-def test_the_same_bits_on_one_two_and_four_devices():
+@pytest.mark.parametrize("algorithm", ["dqn", "pqn"])
+def test_the_same_bits_on_one_two_and_four_devices(algorithm):
     command = [sys.executable, "-c", SCRIPT]
     runs = [
-        subprocess.Popen([*command, str(devices)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment())
+        subprocess.Popen(
+            [*command, str(devices), algorithm], stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment()
+        )
         for devices in (1, 2, 4)
     ]
     outputs = [run.communicate(timeout=300) for run in runs]
