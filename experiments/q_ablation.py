@@ -2,7 +2,7 @@
 
     uv run python experiments/q_ablation.py [--runs runs/ablation] [--out results/table5-best]
 
-Every variant trains on the same 50 layouts, two in each of the 25 cells, that neither the search nor Table 5 has used, with
+Every variant trains on the same 56 layouts, eight in each of seven cells, that neither the search nor Table 5 has used, with
 the same draws. Lifetimes are shares of the upper bound on these draws. Runs that are finished are not repeated. Writes
 `ablation.csv` and prints it.
 """
@@ -21,7 +21,11 @@ from uavmec_jax.studies.statistics import mean_interval
 from uavmec_jax.studies.study import load_study
 from uavmec_jax.training import host
 
-SEEDS = [2_000_000, 2_000_001]
+AXES = {
+    "cells": [[12, 6], [10, 10], [10, 4], [8, 8], [8, 4], [6, 12], [4, 6]],
+    "seeds": [2_000_000 + k for k in range(8)],
+}
+"""Counts of powered and connected devices, and seeds of layouts."""
 CELL = ["powered", "connected"]
 VARIANTS: dict[str, dict[str, Any]] = {
     "the study": {},
@@ -73,7 +77,7 @@ def main() -> None:
 
 def run(arguments: argparse.Namespace, name: str, changes: dict[str, Any]) -> Results:
     """Run the study with some changes, or go on with its run."""
-    draws = {"axes.seeds": SEEDS, "evaluation.draws": 20, "evaluation.planner_draws": 20}
+    draws = {"axes": AXES, "evaluation.draws": 20, "evaluation.planner_draws": 20}
     if arguments.steps:
         changes = changes | {"steps": arguments.steps}
     changes = {key: value for key, value in changes.items() if value is not None}

@@ -40,6 +40,25 @@ def test_a_sweep_over_learning_rates(scenarios):
     assert episodes.length.min() >= 5
 
 
+@pytest.mark.slow
+def test_the_best_q_learner_is_one_line(scenarios):
+    paid_per_slot = jax.vmap(
+        lambda scenario: um.make_scenario(scenario.layout, reward=um.make_reward({}, per_slot=1.0))
+    )
+    best = {**um.DQN_BEST, "steps": 8192, "settings": {"hidden": (16,)}}
+    trained = um.train(scenarios=paid_per_slot(scenarios), key=jax.random.key(1), **best)
+    assert trained.algorithm.name == "pqn"
+    assert trained.result.validation.shape == (3, 1)
+    assert (trained.table()["diverged_at"] == -1).all()
+
+
+def test_the_preset_is_the_study():
+    study = um.load_study("table5-best")
+    assert (study.algorithm, study.steps) == (um.DQN_BEST["algorithm"], um.DQN_BEST["steps"])
+    settings = {**um.DQN_BEST["hyper"], **um.DQN_BEST["settings"]}
+    assert study.pqn == type(study.pqn)(**settings)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -40,19 +40,19 @@ _OPTIMIZER = clipped_adam()
 class PQNHyper:
     """Hyperparameters that may differ between agents of one program (traced)."""
 
-    learning_rate: Scalar = struct.field(default=1e-3, metadata={"gt": 0})
+    learning_rate: Scalar = struct.field(default=1.2e-3, metadata={"gt": 0})
     learning_rate_final: Scalar = struct.field(default=0.0, metadata={"ge": 0, "le": 1})
     """Learning rate at the end of training divided by that at its beginning; it falls linearly."""
     gamma: Scalar = struct.field(default=1.0, metadata={"ge": 0, "le": 1})
-    q_lambda: Scalar = struct.field(default=0.75, metadata={"ge": 0, "le": 1})
+    q_lambda: Scalar = struct.field(default=0.9, metadata={"ge": 0, "le": 1})
     """Weight of longer returns in the targets; 0 gives one-step targets."""
-    gap: Scalar = struct.field(default=0.8, metadata={"ge": 0, "lt": 1})
+    gap: Scalar = struct.field(default=0.7, metadata={"ge": 0, "lt": 1})
     """Share of an action's disadvantage that is subtracted from its target (advantage learning); 0 is plain Q-learning."""
-    exploration_highest_eps: Scalar = struct.field(default=0.4, metadata={"gt": 0, "le": 1})
+    exploration_highest_eps: Scalar = struct.field(default=0.95, metadata={"gt": 0, "le": 1})
     """Epsilon of the first environment; those of the others are spread logarithmically, and none changes."""
-    exploration_lowest_eps: Scalar = struct.field(default=0.02, metadata={"gt": 0, "le": 1})
+    exploration_lowest_eps: Scalar = struct.field(default=0.05, metadata={"gt": 0, "le": 1})
     """Epsilon of the last environment."""
-    guidance: Scalar = struct.field(default=0.5, metadata={"ge": 0, "le": 1})
+    guidance: Scalar = struct.field(default=0.9, metadata={"ge": 0, "le": 1})
     """Share of the exploratory actions that follow the guide, if there is one."""
     average_decay: Scalar = struct.field(default=0.9, metadata={"ge": 0, "lt": 1})
     """Weight of the past in the averaged weights, from one iteration to the next, if weights are averaged."""
@@ -78,11 +78,11 @@ class PQNSpec:
     """Slots played in each environment between updates."""
     batch_size: int = field(default=64, metadata={"ge": 1})
     """Size of a minibatch; it divides ``n_steps * n_envs``."""
-    n_epochs: int = field(default=4, metadata={"ge": 1, "le": 1000})
+    n_epochs: int = field(default=2, metadata={"ge": 1, "le": 1000})
     """Passes over each rollout."""
     cut_traces: bool = True
     """Whether a lambda-return stops at an action that was not the greedy one (Watkins, 1989)."""
-    guide: str = field(default="oldest-first", metadata={"choices": GUIDES})
+    guide: str = field(default="earliest-deadline", metadata={"choices": GUIDES})
     """Heuristic that exploratory actions may follow; ``none`` explores at random."""
     average_weights: bool = True
     """Whether the policy acts by an exponential moving average of the weights."""
