@@ -11,7 +11,6 @@ from tests.agents.test_dqn import huber, random_batch, train
 from tests.populations import differs, make_agent, stack, take
 from uavmec_jax.agents import dqn
 from uavmec_jax.agents.dqn import DQNHyper, DQNSpec
-from uavmec_jax.agents.exploration import GUIDES
 
 SPEC = DQNSpec(total_steps=400)
 
@@ -146,22 +145,49 @@ def test_greedy_actions_do_not_follow_the_guide():
     assert first != 0  # what the guide would do
 
 
-@pytest.mark.parametrize(("guide", "numbers"), [("none", 14), ("oldest-first", 15)])
-def test_the_stream_of_random_numbers_grows_only_with_a_guide(guide, numbers):
-    assert guide in GUIDES
-    assert DQNSpec(guide=guide).numbers_per_step == numbers
+@pytest.mark.parametrize(
+    ("settings", "numbers"),
+    [({}, 14), ({"guide": "oldest-first"}, 15), ({"guide": "oldest-first", "spread_epsilon": True}, 16)],
+)
+def test_settings_that_are_off_draw_no_random_numbers(settings, numbers):
+    assert DQNSpec(**settings).numbers_per_step == numbers
+
+
+def uniform_numbers(spec, agent):
+    """The random numbers of all environment steps, ``[steps, numbers_per_step]``, from the bits themselves."""
+    shape, rows = (spec.train_frequency, spec.numbers_per_step), []
+    for i in range(spec.iterations):
+        bits = jax.random.bits(jax.random.fold_in(agent.key, i), (shape[0] * shape[1] + spec.batch_size,))
+        rows.append((np.asarray(bits[: shape[0] * shape[1]]) >> 8).reshape(shape) / 2**24)
+    return np.concatenate(rows)
+
+
+@pytest.mark.slow
+def test_every_episode_has_an_epsilon_of_its_own():
+    spec = DQNSpec(total_steps=2000, spread_epsilon=True)
+    hyper = {"learning_starts": 0, "exploration_initial_eps": 0.8, "exploration_final_eps": 0.8}
+    agent = make_agent(0, exploration_spread=0.01, **hyper)
+    state, uniform = train(spec, stack([agent]), 0, 500), uniform_numbers(spec, agent)
+    ended = (np.asarray(state.buffer_state[0, 1:, -1]) & 512) > 0
+    share, shares = 1.0, []
+    for numbers, is_end in zip(uniform, ended, strict=True):
+        shares.append(share)
+        share = 0.01 ** numbers[13] if is_end else share
+    assert_allclose(state.epsilon_share[0], share, rtol=1e-5)
+    explores, at_random = (
+        uniform[:, 12] < 0.8 * np.array(shares),
+        actions_of(state) == (uniform[:, -1] * 12).astype(int),
+    )
+    assert at_random[explores].all()
+    assert at_random[~explores].mean() < 0.2  # by chance, 1/12
+    assert ended.sum() > 50
 
 
 @pytest.mark.slow
 def test_warm_up_without_a_guide_makes_the_actions_of_the_stream():
-    """The random actions, from the bits themselves: per step twelve volumes, one number to explore and one action."""
     agent = make_agent(0, learning_starts=400)
     state = train(SPEC, stack([agent]), 0, 100)
-    expected = []
-    for i in range(100):
-        bits = np.asarray(jax.random.bits(jax.random.fold_in(agent.key, i), (4 * 14 + 16,)))
-        expected += [int(word >> 8) * 12 >> 24 for word in bits[:56].reshape(4, 14)[:, 13]]
-    assert_array_equal(actions_of(state), expected)
+    assert_array_equal(actions_of(state), (uniform_numbers(SPEC, agent)[:, 13] * 12).astype(int))
 
 
 def test_layer_norm_normalises_each_hidden_layer_before_its_relu():
@@ -182,7 +208,7 @@ def test_layer_norm_normalises_each_hidden_layer_before_its_relu():
 
 @pytest.mark.slow
 def test_hyperparameters_of_settings_that_are_off_change_nothing(plain):
-    agents = stack([make_agent(0, gap=0.1, guidance=0.9, average_decay=0.2), make_agent(1)])
+    agents = stack([make_agent(0, gap=0.1, guidance=0.9, average_decay=0.2, exploration_spread=0.5), make_agent(1)])
     chex.assert_trees_all_equal(plain, train(SPEC, agents, 0, 100))
 
 
@@ -190,7 +216,7 @@ def test_hyperparameters_of_settings_that_are_off_change_nothing(plain):
 def test_all_settings_together_train():
     spec = DQNSpec(
         total_steps=4_000, double=True, dueling=True, n_step=10, replay_capacity=1_000, advantage_learning=True,
-        layer_norm=True, guide="earliest-deadline", average_weights=True,
+        layer_norm=True, guide="earliest-deadline", average_weights=True, spread_epsilon=True,
     )  # fmt: skip
     state = train(spec, stack([make_agent(0, learning_rate_final=0.1), make_agent(1)]), 0, 1_000)
     assert (state.diverged_at[:2] == -1).all()

@@ -84,6 +84,7 @@ def init(spec: DQNSpec, agent: Agent) -> DQNState:
         episodes=jnp.int32(0),
         loss=jnp.float32(0),
         average=jax.tree.map(jnp.copy, weights) if spec.average_weights else None,
+        epsilon_share=jnp.float32(1) if spec.spread_epsilon else None,
     )
 
 
@@ -106,7 +107,7 @@ def epsilon(hyper: DQNHyper, total_steps: int, steps_done: Int[ArrayLike, ""]) -
     return hyper.exploration_initial_eps + done * (hyper.exploration_final_eps - hyper.exploration_initial_eps)
 
 
-def learning_rate(spec: DQNSpec, hyper: DQNHyper, steps_done: int | Int[Array, ""]) -> Float[ArrayLike, ""]:
+def learning_rate(spec: DQNSpec, hyper: DQNHyper, steps_done: int | Int[Array, ""]) -> Scalar:
     """Return the learning rate of the iteration that ends at ``steps_done``; it falls linearly over all iterations."""
     iterations_before = steps_done // spec.train_frequency - 1
     return linear_decay(hyper.learning_rate, hyper.learning_rate_final, iterations_before / spec.iterations)
@@ -169,9 +170,8 @@ def td_loss(
 def _iteration(spec: DQNSpec, agent: Agent, state: DQNState, i: Int[Array, ""]) -> DQNState:
     """Make ``train_frequency`` environment steps, update the target network if it is due, and make one gradient step.
 
-    All randomness of the iteration comes from a single draw: for each environment step one number for the task volume of
-    each device, one that decides whether to explore, with a guide one that decides whether to follow it, and one for the
-    random action; then one for each sample.
+    All randomness of the iteration comes from a single draw: ``numbers_per_step`` numbers for each environment step, then one
+    for each sample.
     """
     steps_done = i * spec.train_frequency
     per_step = spec.numbers_per_step
@@ -203,21 +203,26 @@ def _act(
     n, scenario = spec.n_devices, _scenario(agent)
     params, layout = scenario.params, scenario.layout
     greedy = greedy_action(spec, agent.hyper, state.weights, observe(params, layout, state.env_state))
-    # Without a guide, the first of the two numbers is not used.
+    # Without a guide, the first of the last two numbers is not used.
     exploratory = exploratory_action(scenario, state.env_state, spec.guide, agent.hyper.guidance, uniform[-2:])
     warm_up = steps_done < agent.hyper.learning_starts
-    explore = warm_up | (uniform[n] < epsilon(agent.hyper, spec.total_steps, steps_done))
+    share = state.epsilon_share
+    rate = epsilon(agent.hyper, spec.total_steps, steps_done)
+    explore = warm_up | (uniform[n] < (rate if share is None else rate * share))
     action = jnp.where(explore, exploratory, greedy)
 
     after, reward, outcome = advance(scenario, state.env_state, action, draw_volumes(params, uniform[:n]))
     terminated = outcome.cause != Cause.NONE
     ended = terminated | is_truncated(scenario, after, outcome)
+    if share is not None:  # log-uniform between the spread and 1
+        share = jnp.where(ended, agent.hyper.exploration_spread ** uniform[n + 1], share)
     row = replay.pack(spec.replay, action, reward, after.battery / layout.capacity, after.age, terminated, ended)
     state = replace(
         state,
         env_state=auto_reset(ended, scenario, state.env_state, after),
         episode_slots=state.episode_slots + jnp.where(ended, after.slot, 0),
         episodes=state.episodes + ended,
+        epsilon_share=share,
     )
     return state, row
 

@@ -28,6 +28,8 @@ class DQNHyper:
     exploration_final_eps: Scalar = struct.field(default=0.05, metadata={"ge": 0, "le": 1})
     exploration_fraction: Scalar = struct.field(default=0.35, metadata={"gt": 0, "le": 1})
     """Share of all steps over which epsilon falls linearly."""
+    exploration_spread: Scalar = struct.field(default=0.05, metadata={"gt": 0, "le": 1})
+    """Lowest epsilon of an episode divided by the schedule's, if every episode has an epsilon of its own."""
     guidance: Scalar = struct.field(default=0.5, metadata={"ge": 0, "le": 1})
     """Share of the exploratory actions that follow the guide, if there is one."""
     gap: Scalar = struct.field(default=0.8, metadata={"ge": 0, "lt": 1})
@@ -66,6 +68,8 @@ class DQNSpec:
     """Whether targets widen the gap between the best action and the others (Bellemare et al., 2016, equation 7)."""
     layer_norm: bool = False
     """Whether hidden layers are normalised (Ba et al., 2016)."""
+    spread_epsilon: bool = False
+    """Whether every episode has an epsilon of its own, as actors have in Horgan et al. (2018), and not the schedule's."""
     guide: str = field(default=NO_GUIDE, metadata={"choices": GUIDES})
     """Heuristic that exploratory actions may follow; ``none`` explores at random."""
     average_weights: bool = False
@@ -90,8 +94,12 @@ class DQNSpec:
 
     @property
     def numbers_per_step(self) -> int:
-        """Random numbers of an environment step: each device's task volume, two for the action, one more with a guide."""
-        return self.n_devices + 2 + (self.guide != NO_GUIDE)
+        """Random numbers of an environment step, uniform in [0, 1).
+
+        They are the task volume of each device; whether to explore; with ``spread_epsilon``, the epsilon of the next episode;
+        with a guide, whether to follow it; and the random action.
+        """
+        return self.n_devices + 2 + self.spread_epsilon + (self.guide != NO_GUIDE)
 
     @property
     def replay(self) -> replay.ReplaySpec:
@@ -131,6 +139,7 @@ class DQNState:
         episodes: number of these episodes, int32.
         loss: the last loss.
         average: moving average of the weights; ``None`` if they are not averaged.
+        epsilon_share: epsilon of the running episode divided by the schedule's; ``None`` if all have the schedule's.
     """
 
     weights: Weights
@@ -143,6 +152,7 @@ class DQNState:
     episodes: Int[Array, "*batch"]
     loss: Float[Array, "*batch"]
     average: Weights | None = None
+    epsilon_share: Float[Array, "*batch"] | None = None
 
     @property
     def policy_weights(self) -> Weights:
