@@ -89,7 +89,9 @@ def test_average_follows_the_weights_with_each_gradient_step():
     expected = jax.tree.map(np.asarray, state.weights)
     for steps_done in (4, 8, 12, 16):
         state = dqn._gradient_step(spec, agent.hyper, state, batch, jnp.int32(steps_done))
-        if steps_done > 8:
+        if steps_done <= 8:  # the warm-up
+            chex.assert_trees_all_equal(state.average, expected)
+        else:
             expected = jax.tree.map(lambda old, new: 0.7 * old + 0.3 * np.asarray(new), expected, state.weights)
             assert all(differs(state.average, state.weights))
         chex.assert_trees_all_close(state.average, expected, rtol=1e-6, atol=1e-7)
