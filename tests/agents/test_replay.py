@@ -91,15 +91,18 @@ def test_only_written_transitions_are_sampled():
     assert set(np.asarray(batch.reward).tolist()) == {float(reward) for _, _, reward, *_ in stored}
 
 
-@pytest.mark.parametrize(("capacity", "written", "wraps"), [(40, 40, False), (16, 100, True)])
-def test_n_step_returns(jit, capacity, written, wraps):
-    spec = ReplaySpec(3, capacity, wraps=wraps, n_step=3)
+@pytest.mark.parametrize(
+    ("capacity", "written", "wraps", "n_step"),
+    [(40, 40, False, 3), (16, 100, True, 3), (16, 100, True, 10), (5, 60, True, 12)],  # the last sums up to the newest
+)
+def test_n_step_returns(jit, capacity, written, wraps, n_step):
+    spec = ReplaySpec(3, capacity, wraps=wraps, n_step=n_step)
     buffer_state, stored = filled(spec, written)
     sample = jit(functools.partial(replay.sample, spec))
     batch = sample(buffer_state, jnp.int32(written), jnp.arange(capacity, dtype=jnp.uint32), GAMMA)
     for i in range(capacity):
         summed, total = 0, 0.0
-        for transition in stored[len(stored) - 1 - i :][:3]:  # up to the newest one
+        for transition in stored[len(stored) - 1 - i :][:n_step]:  # up to the newest one
             total += GAMMA**summed * transition[2]
             summed += 1
             if transition[5]:

@@ -141,7 +141,7 @@ BAD = [
     ({"dqn.clip_range": 0.1}, "bad.toml: dqn.clip_range is not a setting; "),
     (
         {"axes.clip_range": [0.1, 0.2]},
-        "bad.toml: axes.clip_range is not a hyperparameter of dqn, which has learning_rate, gamma, exploration_initial",
+        "bad.toml: axes.clip_range is not a hyperparameter of dqn, which has learning_rate, learning_rate_final, gamma",
     ),
     (
         {"axes.tau": [0.1], "axes.algorithm": ["ppo", "dqn"]},

@@ -5,7 +5,7 @@ environment steps and one gradient step. The population (:mod:`uavmec_jax.traini
 ``vmap``: the iteration number is shared by all agents and never batched; everything that belongs to one agent is batched.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -13,133 +13,39 @@ import chex
 import jax
 import jax.numpy as jnp
 import optax
-from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, UInt
 
 from uavmec_jax.agents import replay
 from uavmec_jax.agents.algorithm import AGENTS_AXIS, Agent, Algorithm
-from uavmec_jax.agents.networks import QNetwork, Weights, count_weights, scale_ages
-from uavmec_jax.agents.optimizers import TrainState, apply_gradients, clipped_adam
-from uavmec_jax.env.dynamics import Cause, State, initial_state
+from uavmec_jax.agents.dqn_spec import DQNHyper, DQNSpec, DQNState
+from uavmec_jax.agents.exploration import exploratory_action
+from uavmec_jax.agents.networks import Weights, scale_ages
+from uavmec_jax.agents.optimizers import TrainState, apply_gradients, clipped_adam, linear_decay
+from uavmec_jax.agents.q_targets import values_of, widen_gap
+from uavmec_jax.env.dynamics import Cause, initial_state
 from uavmec_jax.env.observation import observe
 from uavmec_jax.env.scenario import Scenario, advance, auto_reset, draw_volumes, is_truncated
 from uavmec_jax.env.types import Scalar
 
+__all__ = [
+    "DQNHyper",
+    "DQNSpec",
+    "DQNState",
+    "algorithm",
+    "epsilon",
+    "gradient_steps",
+    "greedy_action",
+    "init",
+    "learning_rate",
+    "q_values",
+    "target_is_due",
+    "td_loss",
+    "update",
+    "update_target",
+]
+
 _WEIGHTS_STREAM = 2**32 - 1
 """``fold_in`` number of the initial weights; the iterations use their own numbers, from 0."""
-
-
-@struct.dataclass
-class DQNHyper:
-    """Hyperparameters that may differ between agents of one program (traced).
-
-    The defaults are those of Table 4, and Stable-Baselines3's where the paper gives none.
-    """
-
-    learning_rate: Scalar = struct.field(default=0.0071, metadata={"gt": 0})
-    gamma: Scalar = struct.field(default=0.98, metadata={"ge": 0, "le": 1})
-    exploration_initial_eps: Scalar = struct.field(default=1.0, metadata={"ge": 0, "le": 1})
-    exploration_final_eps: Scalar = struct.field(default=0.05, metadata={"ge": 0, "le": 1})
-    exploration_fraction: Scalar = struct.field(default=0.35, metadata={"gt": 0, "le": 1})
-    """Share of all steps over which epsilon falls linearly."""
-    target_interval: Scalar = struct.field(default=10_000, metadata={"ge": 1})
-    """Environment steps of one agent between updates of the target network."""
-    tau: Scalar = struct.field(default=1.0, metadata={"gt": 0, "le": 1})
-    """Weight of the online network in an update of the target network: 1 copies it, less is a soft update."""
-    learning_starts: Scalar = struct.field(default=100, metadata={"ge": 0})
-    """Environment steps of one agent with random actions and without gradient steps."""
-    max_grad_norm: Scalar = struct.field(default=10.0, metadata={"gt": 0})
-    age_scale: Scalar = struct.field(default=1.0, metadata={"gt": 0})
-    """Factor on the ages in the network's input; 1 in the paper."""
-
-
-@dataclass(frozen=True)
-class DQNSpec:
-    """Static settings, which shape the program."""
-
-    total_steps: int = 1_000_000
-    """Environment steps of one agent; rounded up to whole iterations."""
-    hidden: tuple[int, ...] = field(default=(64, 64), metadata={"items": {"ge": 1, "le": 4096}})
-    batch_size: int = field(default=16, metadata={"ge": 1})
-    train_frequency: int = field(default=4, metadata={"ge": 1, "le": 64})
-    """Environment steps per gradient step."""
-    replay_capacity: int = field(default=1_000_000, metadata={"ge": 1})
-    double: bool = False
-    """Whether the online network selects the next action and the target network evaluates it (van Hasselt et al., 2016)."""
-    dueling: bool = False
-    """Whether the network outputs a state value and advantages instead of Q-values (Wang et al., 2016)."""
-    n_step: int = field(default=1, metadata={"ge": 1, "le": 64})
-    """Number of rewards summed before the bootstrap (Sutton, 1988)."""
-    n_devices: int = 12
-    max_age: int = 11
-
-    @property
-    def iterations(self) -> int:
-        """Iterations of a whole training."""
-        return -(-self.total_steps // self.train_frequency)
-
-    @property
-    def obs_size(self) -> int:
-        """Length of an observation."""
-        return 2 * self.n_devices
-
-    @property
-    def network(self) -> QNetwork:
-        """The Q-network."""
-        return QNetwork(n_actions=self.n_devices, hidden=self.hidden, dueling=self.dueling)
-
-    @property
-    def replay(self) -> replay.ReplaySpec:
-        """The replay buffer; its capacity is cut to the number of steps, which changes nothing."""
-        steps = self.iterations * self.train_frequency
-        return replay.ReplaySpec(
-            n_devices=self.n_devices,
-            capacity=min(self.replay_capacity, steps),
-            stride=self.train_frequency,
-            max_age=self.max_age,
-            wraps=self.replay_capacity < steps,
-            n_step=self.n_step,
-        )
-
-    @property
-    def agent_bytes(self) -> int:
-        """Memory of one agent in training, bytes.
-
-        That is the replay buffer, the weights, the target's weights, two optimiser moments, a gradient and the best weights.
-        """
-        return self.replay.bytes + 6 * 4 * count_weights(self.network, self.obs_size)
-
-
-@struct.dataclass
-class DQNState:
-    """Everything that changes while an agent trains.
-
-    Attributes:
-        weights: parameters of the Q-network.
-        target: parameters of the target network.
-        opt_state: Adam's moments.
-        env_state: state of the environment.
-        buffer_state: the replay buffer, see :mod:`uavmec_jax.agents.replay`.
-        diverged_at: environment step at which the agent was frozen, int32; -1 if it has not diverged.
-        episode_slots: total length of the episodes that ended in this call of ``update``, slots, int32.
-        episodes: number of these episodes, int32.
-        loss: the last loss.
-    """
-
-    weights: Weights
-    target: Weights
-    opt_state: optax.ScaleByAdamState
-    env_state: State
-    buffer_state: UInt[Array, "*batch rows words"]
-    diverged_at: Int[Array, "*batch"]
-    episode_slots: Int[Array, "*batch"]
-    episodes: Int[Array, "*batch"]
-    loss: Float[Array, "*batch"]
-
-    @property
-    def policy_weights(self) -> Weights:
-        """What the greedy policy is made from."""
-        return self.weights
 
 
 def algorithm(spec: DQNSpec) -> Algorithm:
@@ -177,6 +83,8 @@ def init(spec: DQNSpec, agent: Agent) -> DQNState:
         episode_slots=jnp.int32(0),
         episodes=jnp.int32(0),
         loss=jnp.float32(0),
+        average=jax.tree.map(jnp.copy, weights) if spec.average_weights else None,
+        epsilon_share=jnp.float32(1) if spec.spread_epsilon else None,
     )
 
 
@@ -197,6 +105,12 @@ def epsilon(hyper: DQNHyper, total_steps: int, steps_done: Int[ArrayLike, ""]) -
     progress = jnp.asarray(steps_done, jnp.float32) / total_steps
     done = jnp.minimum(progress / hyper.exploration_fraction, 1.0)
     return hyper.exploration_initial_eps + done * (hyper.exploration_final_eps - hyper.exploration_initial_eps)
+
+
+def learning_rate(spec: DQNSpec, hyper: DQNHyper, steps_done: int | Int[Array, ""]) -> Scalar:
+    """Return the learning rate of the iteration that ends at ``steps_done``; it falls linearly over all iterations."""
+    iterations_before = steps_done // spec.train_frequency - 1
+    return linear_decay(hyper.learning_rate, hyper.learning_rate_final, iterations_before / spec.iterations)
 
 
 def gradient_steps(spec: DQNSpec, hyper: DQNHyper, steps_done: int | Int[Array, ""]) -> Int[Array, ""]:
@@ -236,14 +150,19 @@ def td_loss(
     spec: DQNSpec, hyper: DQNHyper, weights: Weights, target: Weights, batch: replay.Transition
 ) -> Float[Array, ""]:
     """Return the Huber loss of a minibatch against its bootstrapped TD targets (paper, equations 2 and 3)."""
-    next_values = q_values(spec, hyper, target, batch.next_observation)
+    if spec.advantage_learning:  # one pass of the target network
+        both = q_values(spec, hyper, target, jnp.concatenate([batch.observation, batch.next_observation]))
+        old_values, next_values = jnp.split(both, 2)
+    else:
+        next_values = q_values(spec, hyper, target, batch.next_observation)
     next_value = jnp.max(next_values, axis=-1)
     if spec.double:
         next_action = jnp.argmax(q_values(spec, hyper, weights, batch.next_observation), axis=-1)
-        next_value = jnp.sum(next_values * jax.nn.one_hot(next_action, spec.n_devices), axis=-1)
+        next_value = values_of(next_values, next_action)
     td_target = batch.reward + (1.0 - batch.terminated) * batch.discount * next_value
-    taken = jax.nn.one_hot(batch.action, spec.n_devices)
-    value = jnp.sum(q_values(spec, hyper, weights, batch.observation) * taken, axis=-1)
+    if spec.advantage_learning:
+        td_target = widen_gap(td_target, old_values, batch.action, hyper.gap)
+    value = values_of(q_values(spec, hyper, weights, batch.observation), batch.action)
     chex.assert_equal_shape([value, td_target])
     return jnp.mean(optax.huber_loss(value, td_target))
 
@@ -251,11 +170,11 @@ def td_loss(
 def _iteration(spec: DQNSpec, agent: Agent, state: DQNState, i: Int[Array, ""]) -> DQNState:
     """Make ``train_frequency`` environment steps, update the target network if it is due, and make one gradient step.
 
-    All randomness of the iteration comes from a single draw: for each environment step one number for the task volume of
-    each device, one that decides whether to explore and one for the random action; then one for each sample.
+    All randomness of the iteration comes from a single draw: ``numbers_per_step`` numbers for each environment step, then one
+    for each sample.
     """
     steps_done = i * spec.train_frequency
-    per_step = spec.n_devices + 2
+    per_step = spec.numbers_per_step
     n_acting = spec.train_frequency * per_step
     bits = jax.random.bits(jax.random.fold_in(agent.key, i), (n_acting + spec.batch_size,))
     uniform = (bits[:n_acting] >> 8).astype(jnp.float32).reshape(spec.train_frequency, per_step) * 2.0**-24
@@ -278,26 +197,32 @@ def _iteration(spec: DQNSpec, agent: Agent, state: DQNState, i: Int[Array, ""]) 
 
 
 def _act(
-    spec: DQNSpec, agent: Agent, state: DQNState, steps_done: Int[Array, ""], uniform: Float[Array, " n_plus_2"]
+    spec: DQNSpec, agent: Agent, state: DQNState, steps_done: Int[Array, ""], uniform: Float[Array, " numbers"]
 ) -> tuple[DQNState, UInt[Array, " words"]]:
     """Make one epsilon-greedy environment step; also return the transition's row for the replay buffer."""
     n, scenario = spec.n_devices, _scenario(agent)
     params, layout = scenario.params, scenario.layout
     greedy = greedy_action(spec, agent.hyper, state.weights, observe(params, layout, state.env_state))
-    random = jnp.minimum((uniform[n + 1] * n).astype(jnp.int32), n - 1)
+    # Without a guide, the first of the last two numbers is not used.
+    exploratory = exploratory_action(scenario, state.env_state, spec.guide, agent.hyper.guidance, uniform[-2:])
     warm_up = steps_done < agent.hyper.learning_starts
-    explore = warm_up | (uniform[n] < epsilon(agent.hyper, spec.total_steps, steps_done))
-    action = jnp.where(explore, random, greedy)
+    share = state.epsilon_share
+    rate = epsilon(agent.hyper, spec.total_steps, steps_done)
+    explore = warm_up | (uniform[n] < (rate if share is None else rate * share))
+    action = jnp.where(explore, exploratory, greedy)
 
     after, reward, outcome = advance(scenario, state.env_state, action, draw_volumes(params, uniform[:n]))
     terminated = outcome.cause != Cause.NONE
     ended = terminated | is_truncated(scenario, after, outcome)
+    if share is not None:  # log-uniform between the spread and 1
+        share = jnp.where(ended, agent.hyper.exploration_spread ** uniform[n + 1], share)
     row = replay.pack(spec.replay, action, reward, after.battery / layout.capacity, after.age, terminated, ended)
     state = replace(
         state,
         env_state=auto_reset(ended, scenario, state.env_state, after),
         episode_slots=state.episode_slots + jnp.where(ended, after.slot, 0),
         episodes=state.episodes + ended,
+        epsilon_share=share,
     )
     return state, row
 
@@ -305,23 +230,28 @@ def _act(
 def _gradient_step(
     spec: DQNSpec, hyper: DQNHyper, state: DQNState, batch: replay.Transition, steps_done: int | Int[Array, ""]
 ) -> DQNState:
-    """Make one gradient step, unless the agent is still warming up or has diverged."""
+    """Make one gradient step and average the weights, unless the agent is still warming up or has diverged."""
+    learning = steps_done > hyper.learning_starts
     loss, gradient = jax.value_and_grad(lambda w: td_loss(spec, hyper, w, state.target, batch))(state.weights)
     train_state = apply_gradients(
         clipped_adam(),
         TrainState(state.weights, state.opt_state, state.diverged_at),
         loss,
         gradient,
-        learning_rate=hyper.learning_rate,
+        learning_rate=learning_rate(spec, hyper, steps_done),
         max_norm=hyper.max_grad_norm,
         count=gradient_steps(spec, hyper, steps_done),
         steps_done=steps_done,
-        learning=steps_done > hyper.learning_starts,
+        learning=learning,
     )
+    average = state.average
+    if average is not None:  # it follows the weights as a target network with soft updates does
+        average = update_target(learning, 1.0 - hyper.average_decay, train_state.weights, average)
     return replace(
         state,
         weights=train_state.weights,
         opt_state=train_state.opt_state,
         diverged_at=train_state.diverged_at,
         loss=loss,
+        average=average,
     )

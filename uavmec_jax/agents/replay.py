@@ -170,7 +170,7 @@ def sample(
     initial = np.concatenate([np.ones(spec.n_devices, np.float32), np.zeros(spec.n_devices, np.float32)])
     reward, discount, last = _reward(row), jnp.broadcast_to(jnp.asarray(gamma, jnp.float32), back.shape), row
     if spec.n_step > 1:
-        reward, discount, last = _n_step(spec, buffer_state, position, back, row, gamma)
+        reward, discount, last = _n_step(spec, buffer_state, position, back, gamma)
     return Transition(
         observation=jnp.where((before[:, -1:] & _ENDED) > 0, initial, _observation(spec, before)),
         action=(row[:, -1] & (_TERMINATED - 1)).astype(jnp.int32),
@@ -186,7 +186,6 @@ def _n_step(
     buffer_state: UInt[Array, "rows words"],
     position: Int[Array, " B"],
     back: Int[Array, " B"],
-    row: UInt[Array, "B words"],
     gamma: Scalar,
 ) -> tuple[Float[Array, " B"], Float[Array, " B"], UInt[Array, "B words"]]:
     """Return the discounted sum of up to ``n_step`` rewards, the discount of the bootstrap, and the last row summed.
@@ -198,24 +197,27 @@ def _n_step(
         buffer_state: the rows.
         position: place of each sample's first transition in the ring.
         back: number of transitions written after it.
-        row: its row.
         gamma: discount factor of one slot.
     """
+    # Of the rows in between, only the last two words are read: the reward and the tag.
+    rows = 1 + (position[:, None] + np.arange(spec.n_step)) % spec.ring
+    ends = buffer_state[rows, -2:]
+    rewards, is_end = _reward(ends), (ends[..., -1] & _ENDED) > 0
     continues = jnp.ones(position.shape, bool)
-    total, discount, last = jnp.zeros(position.shape), jnp.ones(position.shape), row
+    total, discount = jnp.zeros(position.shape), jnp.ones(position.shape)
+    summed = jnp.zeros(position.shape, jnp.int32)
     for k in range(spec.n_step):
-        current = buffer_state[1 + (position + k) % spec.ring]
         continues = continues & (back >= k)
-        total = total + jnp.where(continues, discount * _reward(current), 0.0)
+        total = total + jnp.where(continues, discount * rewards[:, k], 0.0)
         discount = jnp.where(continues, discount * gamma, discount)
-        last = jnp.where(continues[:, None], current, last)
-        continues = continues & ((current[:, -1] & _ENDED) == 0)
-    return total, discount, last
+        summed = summed + continues
+        continues = continues & ~is_end[:, k]
+    return total, discount, buffer_state[1 + (position + summed - 1) % spec.ring]
 
 
-def _reward(row: UInt[Array, "B words"]) -> Float[Array, " B"]:
+def _reward(row: UInt[Array, "*B words"]) -> Float[Array, "*B"]:
     """Unpack the rewards of rows."""
-    return jax.lax.bitcast_convert_type(row[:, -2], jnp.float32)
+    return jax.lax.bitcast_convert_type(row[..., -2], jnp.float32)
 
 
 def _observation(spec: ReplaySpec, row: UInt[Array, "B words"]) -> Float[Array, "B two_n"]:
