@@ -58,7 +58,7 @@ def filled(spec, n, seed=0):
     ],
 )
 def test_every_transition_is_stored_exactly(jit, n_devices, capacity, stride, max_age, written, wraps):
-    spec = ReplaySpec(n_devices, capacity, stride, max_age, wraps)
+    spec = ReplaySpec(n_devices, capacity, stride, wraps, max_age=max_age)
     buffer_state, stored = filled(spec, written)
     size = min(written, capacity)
     sample = jit(functools.partial(replay.sample, spec))

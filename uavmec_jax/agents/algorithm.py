@@ -26,7 +26,7 @@ class Agent:
 
     Attributes:
         key: the agent's own randomness, derived from its identity, never from its place in a batch.
-        scenario: the scenario of all its episodes, or (except for DQN) a distribution from which every episode draws its own.
+        scenario: the scenario of all its episodes, or a distribution from which every episode draws its own.
         hyper: the traced hyperparameters, a pytree that the algorithm declares.
     """
 

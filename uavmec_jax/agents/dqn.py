@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, UInt
 
-from uavmec_jax.agents import replay
+from uavmec_jax.agents import episode, replay, state_replay
 from uavmec_jax.agents.algorithm import AGENTS_AXIS, Agent, Algorithm
 from uavmec_jax.agents.dqn_spec import DQNHyper, DQNSpec, DQNState
 from uavmec_jax.agents.exploration import exploratory_action
@@ -23,8 +23,7 @@ from uavmec_jax.agents.networks import Weights, scale_ages
 from uavmec_jax.agents.optimizers import TrainState, apply_gradients, clipped_adam, linear_decay
 from uavmec_jax.agents.q_targets import values_of, widen_gap
 from uavmec_jax.env.dynamics import Cause, initial_state
-from uavmec_jax.env.observation import observe
-from uavmec_jax.env.scenario import Scenario, advance, auto_reset, draw_volumes, is_truncated
+from uavmec_jax.env.scenario import advance, auto_reset, draw_volumes, is_truncated
 from uavmec_jax.env.types import Scalar
 
 __all__ = [
@@ -52,12 +51,15 @@ def algorithm(spec: DQNSpec) -> Algorithm:
     """Return the algorithm with its static settings bound.
 
     Raises:
-        ValueError: there are more devices than the replay buffer can tell apart.
+        ValueError: there are more devices than the replay buffer can tell apart, or it keeps too few scenarios.
     """
-    if spec.n_devices > replay.MAX_ACTIONS:
+    if spec.sees_paper and spec.n_devices > replay.MAX_ACTIONS:
         raise ValueError(
-            f"n_devices is {spec.n_devices}; a DQN replay holds at most {replay.MAX_ACTIONS} devices; take ppo or a2c"
+            f"n_devices is {spec.n_devices}; a DQN replay holds at most {replay.MAX_ACTIONS} devices; give "
+            "observation = 'full', or take pqn, ppo or a2c"
         )
+    if spec.scenario_ring < 2:  # that of the newest transition, and that of an episode that has just begun
+        raise ValueError(f"scenario_ring is {spec.scenario_ring}; it should be at least 2")
     return Algorithm(
         name="dqn",
         iterations=spec.iterations,
@@ -66,12 +68,14 @@ def algorithm(spec: DQNSpec) -> Algorithm:
         init=partial(init, spec),
         update=partial(update, spec),
         greedy=partial(greedy_action, spec),
+        observation_fn=spec.observation_spec.observation_fn,
     )
 
 
 def init(spec: DQNSpec, agent: Agent) -> DQNState:
     """Return an agent's state before training: random weights, a target equal to them, an empty buffer, a new episode."""
-    scenario = _scenario(agent)
+    running = episode.start(agent, spec.scenarios_kept)
+    scenario = episode.scenario_of(agent, running)
     weights = spec.network.init(jax.random.fold_in(agent.key, _WEIGHTS_STREAM), jnp.zeros((1, spec.obs_size)))
     return DQNState(
         weights=weights,
@@ -85,13 +89,8 @@ def init(spec: DQNSpec, agent: Agent) -> DQNState:
         loss=jnp.float32(0),
         average=jax.tree.map(jnp.copy, weights) if spec.average_weights else None,
         epsilon_share=jnp.float32(1) if spec.spread_epsilon else None,
+        episode=running,
     )
-
-
-def _scenario(agent: Agent) -> Scenario:
-    """Return the scenario of all the agent's episodes; DQN does not train on distributions."""
-    assert isinstance(agent.scenario, Scenario)
-    return agent.scenario
 
 
 def update(spec: DQNSpec, agent: Agent, state: DQNState, first: Int[Array, ""], last: Int[Array, ""]) -> DQNState:
@@ -134,9 +133,12 @@ def update_target(due: Bool[ArrayLike, ""], tau: Scalar, weights: Weights, targe
 def q_values(
     spec: DQNSpec, hyper: DQNHyper, weights: Weights, observation: Float[Array, "*b obs_size"]
 ) -> Float[Array, "*b n"]:
-    """Return the Q-values of all actions; the ages are multiplied by the agent's ``age_scale``."""
-    values: Any = spec.network.apply(weights, scale_ages(observation, hyper.age_scale))
-    return values
+    """Return the Q-values of all actions; the ages of the paper's observation are multiplied by ``age_scale``."""
+    if spec.sees_paper:
+        values: Any = spec.network.apply(weights, scale_ages(observation, hyper.age_scale))
+        return values
+    values = spec.network.apply(weights, observation.reshape(-1, spec.obs_size))
+    return values.reshape(*observation.shape[:-1], spec.n_devices)
 
 
 def greedy_action(
@@ -191,8 +193,8 @@ def _iteration(spec: DQNSpec, agent: Agent, state: DQNState, i: Int[Array, ""]) 
         lambda: update_target(due, agent.hyper.tau, state.weights, state.target),
         lambda: state.target,
     )
-    batch = replay.sample(spec.replay, buffer_state, steps_done, bits[n_acting:], agent.hyper.gamma)
     state = replace(state, buffer_state=buffer_state, target=target)
+    batch = _sample(spec, agent, state, steps_done, bits[n_acting:])
     return _gradient_step(spec, agent.hyper, state, batch, steps_done)
 
 
@@ -200,9 +202,10 @@ def _act(
     spec: DQNSpec, agent: Agent, state: DQNState, steps_done: Int[Array, ""], uniform: Float[Array, " numbers"]
 ) -> tuple[DQNState, UInt[Array, " words"]]:
     """Make one epsilon-greedy environment step; also return the transition's row for the replay buffer."""
-    n, scenario = spec.n_devices, _scenario(agent)
+    n, scenario = spec.n_devices, episode.scenario_of(agent, state.episode)
     params, layout = scenario.params, scenario.layout
-    greedy = greedy_action(spec, agent.hyper, state.weights, observe(params, layout, state.env_state))
+    observation = spec.observation_spec.observation_fn(params, layout, state.env_state)
+    greedy = greedy_action(spec, agent.hyper, state.weights, observation)
     # Without a guide, the first of the last two numbers is not used.
     exploratory = exploratory_action(scenario, state.env_state, spec.guide, agent.hyper.guidance, uniform[-2:])
     warm_up = steps_done < agent.hyper.learning_starts
@@ -216,15 +219,37 @@ def _act(
     ended = terminated | is_truncated(scenario, after, outcome)
     if share is not None:  # log-uniform between the spread and 1
         share = jnp.where(ended, agent.hyper.exploration_spread ** uniform[n + 1], share)
-    row = replay.pack(spec.replay, action, reward, after.battery / layout.capacity, after.age, terminated, ended)
+    if spec.sees_paper:
+        row = replay.pack(spec.replay, action, reward, after.battery / layout.capacity, after.age, terminated, ended)
+    else:
+        number = jnp.int32(0) if state.episode is None else state.episode.number
+        row = state_replay.pack(spec.replay, action, reward, after, number, terminated, ended)
+    running = episode.follow(agent, state.episode, ended, steps_done + 1)
+    next_scenario = episode.scenario_of(agent, running)
     state = replace(
         state,
-        env_state=auto_reset(ended, scenario, state.env_state, after),
+        env_state=auto_reset(ended, next_scenario, state.env_state, after),
+        episode=running,
         episode_slots=state.episode_slots + jnp.where(ended, after.slot, 0),
         episodes=state.episodes + ended,
         epsilon_share=share,
     )
     return state, row
+
+
+def _sample(
+    spec: DQNSpec, agent: Agent, state: DQNState, steps_done: Int[Array, ""], bits: UInt[Array, " B"]
+) -> replay.Transition:
+    """Sample a minibatch; ``bits`` has one uniform word for each sample."""
+    arguments = spec.replay, state.buffer_state, steps_done, bits, agent.hyper.gamma
+    if spec.sees_paper:
+        return replay.sample(*arguments)
+    return state_replay.sample(
+        *arguments,
+        oldest=episode.oldest_transition(state.episode),
+        scenario_of=partial(episode.kept_scenario, agent, state.episode),
+        observation_fn=spec.observation_spec.observation_fn,
+    )
 
 
 def _gradient_step(

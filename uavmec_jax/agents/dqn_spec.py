@@ -3,12 +3,15 @@
 from dataclasses import dataclass, field
 
 import optax
+from flax import linen as nn
 from flax import struct
 from jaxtyping import Array, Float, Int, UInt
 
-from uavmec_jax.agents import replay
+from uavmec_jax.agents import replay, state_replay
+from uavmec_jax.agents.episode import RunningEpisode, ring_bytes
 from uavmec_jax.agents.exploration import GUIDES, NO_GUIDE
 from uavmec_jax.agents.networks import QNetwork, Weights, count_weights
+from uavmec_jax.agents.observation_spec import OBSERVATIONS, ObservationSpec
 from uavmec_jax.env.dynamics import State
 from uavmec_jax.env.types import Scalar
 
@@ -44,7 +47,7 @@ class DQNHyper:
     """Environment steps of one agent with random actions and without gradient steps."""
     max_grad_norm: Scalar = struct.field(default=10.0, metadata={"gt": 0})
     age_scale: Scalar = struct.field(default=1.0, metadata={"gt": 0})
-    """Factor on the ages in the network's input; 1 in the paper."""
+    """Factor on the ages in the paper's observation; 1 in the paper."""
 
 
 @dataclass(frozen=True)
@@ -54,14 +57,19 @@ class DQNSpec:
     total_steps: int = 1_000_000
     """Environment steps of one agent; rounded up to whole iterations."""
     hidden: tuple[int, ...] = field(default=(64, 64), metadata={"items": {"ge": 1, "le": 4096}})
+    observation: str = field(default="paper", metadata={"choices": tuple(OBSERVATIONS)})
+    """Input of the network: ``paper`` (batteries and ages), or ``full``, with which it is permutation-equivariant."""
     batch_size: int = field(default=16, metadata={"ge": 1})
     train_frequency: int = field(default=4, metadata={"ge": 1, "le": 64})
     """Environment steps per gradient step."""
     replay_capacity: int = field(default=1_000_000, metadata={"ge": 1})
+    scenario_ring: int = field(default=4096, metadata={"ge": 2})
+    """Drawn scenarios that are kept for the full observation; samples are from the last so many episodes."""
     double: bool = False
     """Whether the online network selects the next action and the target network evaluates it (van Hasselt et al., 2016)."""
     dueling: bool = False
-    """Whether the network outputs a state value and advantages instead of Q-values (Wang et al., 2016)."""
+    """Whether the network outputs a state value and advantages instead of Q-values (Wang et al., 2016); that for the full
+    observation always does."""
     n_step: int = field(default=1, metadata={"ge": 1, "le": 64})
     """Number of rewards summed before the bootstrap (Sutton, 1988)."""
     advantage_learning: bool = False
@@ -83,14 +91,26 @@ class DQNSpec:
         return -(-self.total_steps // self.train_frequency)
 
     @property
-    def obs_size(self) -> int:
-        """Length of an observation."""
-        return 2 * self.n_devices
+    def observation_spec(self) -> ObservationSpec:
+        """The observation, and the networks that take it."""
+        return OBSERVATIONS[self.observation]
 
     @property
-    def network(self) -> QNetwork:
+    def sees_paper(self) -> bool:
+        """Whether the observation is the paper's."""
+        return self.observation == "paper"
+
+    @property
+    def obs_size(self) -> int:
+        """Length of an observation."""
+        return self.observation_spec.obs_size(self.n_devices)
+
+    @property
+    def network(self) -> nn.Module:
         """The Q-network."""
-        return QNetwork(self.n_devices, self.hidden, dueling=self.dueling, layer_norm=self.layer_norm)
+        if self.sees_paper:
+            return QNetwork(self.n_devices, self.hidden, dueling=self.dueling, layer_norm=self.layer_norm)
+        return self.observation_spec.q_network(self.n_devices, self.hidden, self.layer_norm)
 
     @property
     def numbers_per_step(self) -> int:
@@ -102,26 +122,30 @@ class DQNSpec:
         return self.n_devices + 2 + self.spread_epsilon + (self.guide != NO_GUIDE)
 
     @property
-    def replay(self) -> replay.ReplaySpec:
+    def replay(self) -> replay.ReplaySpec | state_replay.StateReplaySpec:
         """The replay buffer; its capacity is cut to the number of steps, which changes nothing."""
         steps = self.iterations * self.train_frequency
-        return replay.ReplaySpec(
-            n_devices=self.n_devices,
-            capacity=min(self.replay_capacity, steps),
-            stride=self.train_frequency,
-            max_age=self.max_age,
-            wraps=self.replay_capacity < steps,
-            n_step=self.n_step,
-        )
+        capacity, wraps = min(self.replay_capacity, steps), self.replay_capacity < steps
+        shape = {"n_devices": self.n_devices, "capacity": capacity, "stride": self.train_frequency, "n_step": self.n_step}
+        if self.sees_paper:
+            return replay.ReplaySpec(**shape, wraps=wraps, max_age=self.max_age)
+        return state_replay.StateReplaySpec(**shape, wraps=wraps)
+
+    @property
+    def scenarios_kept(self) -> int:
+        """Number of drawn scenarios in memory: none for the paper's observation, at most one per step."""
+        return 0 if self.sees_paper else min(self.scenario_ring, self.iterations * self.train_frequency + 1)
 
     @property
     def agent_bytes(self) -> int:
         """Memory of one agent in training, bytes.
 
-        That is the replay buffer, the weights, the target's weights, two optimiser moments, a gradient, the best weights and,
-        if there is one, the average of the weights.
+        That is the replay buffer, the scenarios of its samples (even if there is one for all, which is little then), the
+        weights, the target's weights, two optimiser moments, a gradient, the best weights and, if there is one, the average
+        of the weights.
         """
-        return self.replay.bytes + (6 + self.average_weights) * 4 * count_weights(self.network, self.obs_size)
+        buffers = self.replay.bytes + ring_bytes(self.n_devices, self.scenarios_kept)
+        return buffers + (6 + self.average_weights) * 4 * count_weights(self.network, self.obs_size)
 
 
 @struct.dataclass
@@ -133,13 +157,14 @@ class DQNState:
         target: parameters of the target network.
         opt_state: Adam's moments.
         env_state: state of the environment.
-        buffer_state: the replay buffer, see :mod:`uavmec_jax.agents.replay`.
+        buffer_state: the replay buffer, see :mod:`uavmec_jax.agents.replay` and :mod:`uavmec_jax.agents.state_replay`.
         diverged_at: environment step at which the agent was frozen, int32; -1 if it has not diverged.
         episode_slots: total length of the episodes that ended in this call of ``update``, slots, int32.
         episodes: number of these episodes, int32.
         loss: the last loss.
         average: moving average of the weights; ``None`` if they are not averaged.
         epsilon_share: epsilon of the running episode divided by the schedule's; ``None`` if all have the schedule's.
+        episode: the running episode and the scenarios of earlier ones; ``None`` if all have the agent's scenario.
     """
 
     weights: Weights
@@ -153,6 +178,7 @@ class DQNState:
     loss: Float[Array, "*batch"]
     average: Weights | None = None
     epsilon_share: Float[Array, "*batch"] | None = None
+    episode: RunningEpisode | None = None
 
     @property
     def policy_weights(self) -> Weights:

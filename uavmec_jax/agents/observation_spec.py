@@ -1,4 +1,4 @@
-"""The observations that PQN, PPO and A2C can learn from, the paper's and the full one, and the networks for each."""
+"""The observations that agents can learn from, the paper's and the full one, and the networks for each."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -75,14 +75,19 @@ ALGORITHMS: Mapping[str, RegisteredAlgorithm] = MappingProxyType(
 """The algorithms by their names in study files."""
 
 
-def check_end(algorithm: str, end: str) -> None:
+def check_end(algorithm: str, end: str, observation: str = "paper") -> None:
     """Check that an algorithm can be trained where episodes have a certain end.
 
+    Args:
+        algorithm: its name.
+        end: what ends an episode, as in :class:`Params`.
+        observation: what its network sees, ``paper`` or ``full``.
+
     Raises:
-        ValueError: it is a DQN, and episodes go on after a failure; one line.
+        ValueError: it is a DQN with the paper's observation, and episodes go on after a failure; one line.
     """
-    if algorithm == "dqn" and end == "horizon":
+    if algorithm == "dqn" and end == "horizon" and observation == "paper":
         raise ValueError(
-            "params.end is 'horizon', and algorithm is 'dqn', whose replay holds no ages beyond their limit; give "
-            "end = 'first_failure', or take 'ppo' or 'a2c'"
+            "params.end is 'horizon', and algorithm is 'dqn', whose replay of the paper's observation holds no ages beyond "
+            "their limit; give end = 'first_failure' or observation = 'full', or take 'pqn', 'ppo' or 'a2c'"
         )

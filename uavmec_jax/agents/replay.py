@@ -5,7 +5,8 @@ transition is that of the previous row, or the initial one if an episode ended t
 neighbouring rows (two cache lines) instead of five scattered arrays, and 75 agents with 1,000,000 transitions each fit in
 4.5 GiB. Battery fractions and rewards are stored exactly; ages are small integers and are packed.
 
-The functions are pure; ``buffer_state`` is the array of all rows.
+The functions are pure; ``buffer_state`` is the array of all rows. :func:`add`, :func:`sample_rows` and :func:`flags_word` also
+serve the rows of :mod:`uavmec_jax.agents.state_replay`, whose last two words are the reward and the flags, too.
 """
 
 from dataclasses import dataclass
@@ -21,15 +22,17 @@ from uavmec_jax.env.types import Scalar
 _ACTION_BITS = 8
 MAX_ACTIONS = 1 << _ACTION_BITS
 """Largest number of actions that a row can tell apart."""
-_TERMINATED = 1 << _ACTION_BITS
-_ENDED = 2 << _ACTION_BITS
+TERMINATED = 1 << _ACTION_BITS
+"""Flag in a row's last word: the episode terminated."""
+ENDED = 2 << _ACTION_BITS
+"""Flag in a row's last word: the episode terminated or was truncated."""
 
 
 class Transition(NamedTuple):
     """A batch of transitions.
 
     Attributes:
-        observation: the paper's observation before the action.
+        observation: the observation before the action.
         action: the device visited.
         reward: the reward; with n-step returns the discounted sum of the rewards up to ``next_observation``.
         terminated: 1 if the episode terminated in ``next_observation``, so that nothing is bootstrapped from it, else 0.
@@ -45,15 +48,42 @@ class Transition(NamedTuple):
     discount: Float[Array, "*batch B"]
 
 
-@dataclass(frozen=True)
-class ReplaySpec:
-    """Shape of one agent's replay buffer (static).
+class SampledRows(NamedTuple):
+    """The rows that a batch of samples is made of.
 
     Attributes:
-        n_devices: number of devices, at most :data:`MAX_ACTIONS`.
+        before: each sample's previous row.
+        row: its own row.
+        last: the row of the last transition that it sums up; its own without n-step returns.
+        reward: as in :class:`Transition`.
+        discount: as in :class:`Transition`.
+    """
+
+    before: UInt[Array, "B words"]
+    row: UInt[Array, "B words"]
+    last: UInt[Array, "B words"]
+    reward: Float[Array, " B"]
+    discount: Float[Array, " B"]
+
+    @property
+    def starts(self) -> Bool[Array, " B"]:
+        """Whether each sample is the first transition of its episode."""
+        return (self.before[:, -1] & ENDED) > 0
+
+    @property
+    def terminated(self) -> Float[Array, " B"]:
+        """As in :class:`Transition`."""
+        return ((self.last[:, -1] & TERMINATED) > 0).astype(jnp.float32)
+
+
+@dataclass(frozen=True)
+class RingSpec:
+    """Shape of a ring of rows (static); what is in a row is left to the subclasses.
+
+    Attributes:
+        n_devices: number of devices.
         capacity: number of transitions that can be sampled.
         stride: number of transitions written at a time; the ring is a multiple of it, so no single write wraps around.
-        max_age: largest age that can occur, slots.
         wraps: whether more than ``capacity`` transitions will be written.
         n_step: number of transitions that one sample sums up.
     """
@@ -61,7 +91,6 @@ class ReplaySpec:
     n_devices: int
     capacity: int
     stride: int = 4
-    max_age: int = 11
     wraps: bool = True
     n_step: int = 1
 
@@ -73,6 +102,27 @@ class ReplaySpec:
         """
         needed = self.capacity + (1 if self.wraps else 0)
         return -(-needed // self.stride) * self.stride
+
+    @property
+    def words(self) -> int:
+        """Number of words in a row."""
+        raise NotImplementedError
+
+    @property
+    def bytes(self) -> int:
+        """Memory of one agent, bytes."""
+        return 4 * (self.ring + 1) * self.words
+
+
+@dataclass(frozen=True)
+class ReplaySpec(RingSpec):
+    """Shape of one agent's replay buffer of the paper's observations; at most :data:`MAX_ACTIONS` devices.
+
+    Attributes:
+        max_age: largest age that can occur, slots.
+    """
+
+    max_age: int = 11
 
     @property
     def age_bits(self) -> int:
@@ -89,16 +139,11 @@ class ReplaySpec:
         """Number of words in a row: batteries, packed ages, the reward, and one word for the action and the flags."""
         return self.n_devices + -(-self.n_devices // self.ages_per_word) + 2
 
-    @property
-    def bytes(self) -> int:
-        """Memory of one agent, bytes."""
-        return 4 * (self.ring + 1) * self.words
 
-
-def init(spec: ReplaySpec) -> UInt[Array, "rows words"]:
+def init(spec: RingSpec) -> UInt[Array, "rows words"]:
     """Return an empty buffer, ``[ring + 1, words]``. Row 0, before the first transition, says that an episode ended."""
     buffer_state = jnp.zeros((spec.ring + 1, spec.words), jnp.uint32)
-    return buffer_state.at[0, -1].set(_ENDED)
+    return buffer_state.at[0, -1].set(ENDED)
 
 
 def pack(
@@ -125,14 +170,21 @@ def pack(
     padded = jnp.pad(age.astype(jnp.uint32), (0, words * spec.ages_per_word - spec.n_devices))
     shifts = np.arange(spec.ages_per_word, dtype=np.uint32) * spec.age_bits
     ages = jnp.sum(padded.reshape(words, spec.ages_per_word) << shifts, axis=-1, dtype=jnp.uint32)
-    tag = action.astype(jnp.uint32) | jnp.where(terminated, _TERMINATED, 0).astype(jnp.uint32)
-    tag = tag | jnp.where(ended, _ENDED, 0).astype(jnp.uint32)
+    tag = flags_word(action.astype(jnp.uint32), terminated, ended)
     bits = jax.lax.bitcast_convert_type
     return jnp.concatenate([bits(battery_fraction, jnp.uint32), ages, bits(reward, jnp.uint32)[None], tag[None]])
 
 
+def flags_word(
+    word: UInt[Array, ""], terminated: Bool[Array, ""], ended: Bool[Array, ""]
+) -> UInt[Array, ""]:
+    """Return a row's last word: ``word``, which is less than :data:`MAX_ACTIONS`, and the flags."""
+    word = word | jnp.where(terminated, TERMINATED, 0).astype(jnp.uint32)
+    return word | jnp.where(ended, ENDED, 0).astype(jnp.uint32)
+
+
 def add(
-    spec: ReplaySpec,
+    spec: RingSpec,
     buffer_state: UInt[Array, "rows words"],
     written: Int[Array, ""],
     new_rows: UInt[Array, "stride words"],
@@ -162,27 +214,51 @@ def sample(
         bits: one uniform 32-bit word per sample. (The bias of the modulo is below capacity / 2**32.)
         gamma: discount factor of one slot.
     """
+    rows = sample_rows(spec, buffer_state, written, bits, gamma)
+    initial = np.concatenate([np.ones(spec.n_devices, np.float32), np.zeros(spec.n_devices, np.float32)])
+    return Transition(
+        observation=jnp.where(rows.starts[:, None], initial, _observation(spec, rows.before)),
+        action=(rows.row[:, -1] & (TERMINATED - 1)).astype(jnp.int32),
+        reward=rows.reward,
+        terminated=rows.terminated,
+        next_observation=_observation(spec, rows.last),
+        discount=rows.discount,
+    )
+
+
+def sample_rows(
+    spec: RingSpec,
+    buffer_state: UInt[Array, "rows words"],
+    written: Int[Array, ""],
+    bits: UInt[Array, " B"],
+    gamma: Scalar,
+    oldest: Int[Array, ""] | None = None,
+) -> SampledRows:
+    """Sample the rows of transitions uniformly, with replacement, from the newest ``min(written, capacity)``.
+
+    Args:
+        spec: shape of the buffer.
+        buffer_state: the rows.
+        written: number of transitions written so far, at least 1.
+        bits: one uniform 32-bit word per sample.
+        gamma: discount factor of one slot.
+        oldest: number of the oldest transition that may be sampled, less than ``written``; ``None``: all may.
+    """
     size = jnp.minimum(written, spec.capacity)
+    if oldest is not None:
+        size = jnp.minimum(size, written - oldest)
     back = (bits % size.astype(jnp.uint32)).astype(jnp.int32)
     position = (written - 1 - back) % spec.ring
     pairs = jax.vmap(lambda start: jax.lax.dynamic_slice(buffer_state, (start, 0), (2, spec.words)))(position)
     before, row = pairs[:, 0], pairs[:, 1]
-    initial = np.concatenate([np.ones(spec.n_devices, np.float32), np.zeros(spec.n_devices, np.float32)])
     reward, discount, last = _reward(row), jnp.broadcast_to(jnp.asarray(gamma, jnp.float32), back.shape), row
     if spec.n_step > 1:
         reward, discount, last = _n_step(spec, buffer_state, position, back, gamma)
-    return Transition(
-        observation=jnp.where((before[:, -1:] & _ENDED) > 0, initial, _observation(spec, before)),
-        action=(row[:, -1] & (_TERMINATED - 1)).astype(jnp.int32),
-        reward=reward,
-        terminated=((last[:, -1] & _TERMINATED) > 0).astype(jnp.float32),
-        next_observation=_observation(spec, last),
-        discount=discount,
-    )
+    return SampledRows(before=before, row=row, last=last, reward=reward, discount=discount)
 
 
 def _n_step(
-    spec: ReplaySpec,
+    spec: RingSpec,
     buffer_state: UInt[Array, "rows words"],
     position: Int[Array, " B"],
     back: Int[Array, " B"],
@@ -202,7 +278,7 @@ def _n_step(
     # Of the rows in between, only the last two words are read: the reward and the tag.
     rows = 1 + (position[:, None] + np.arange(spec.n_step)) % spec.ring
     ends = buffer_state[rows, -2:]
-    rewards, is_end = _reward(ends), (ends[..., -1] & _ENDED) > 0
+    rewards, is_end = _reward(ends), (ends[..., -1] & ENDED) > 0
     continues = jnp.ones(position.shape, bool)
     total, discount = jnp.zeros(position.shape), jnp.ones(position.shape)
     summed = jnp.zeros(position.shape, jnp.int32)

@@ -149,14 +149,10 @@ class Study(StrictModel):
 
 
 def _check_drawn(study: Study) -> None:
-    """Check that the algorithms can train on drawn scenarios, and that no other setting determines the scenario."""
+    """Check that no other setting determines the scenario."""
     if study.scenarios is None:
         return
     check_scenarios(study.scenarios, study.params.n_devices)
-    if "dqn" in study.algorithms:
-        raise ValueError(
-            "scenarios are given, and algorithm is 'dqn', which trains on one scenario; take 'ppo' or 'a2c'"
-        )
     for name in ("place", "traffic_bonus", "traffic_penalty"):
         if getattr(study, name) or name in study.axes:
             raise ValueError(f"{name} is given, and scenarios too, which draw their own; leave one of them out")
@@ -226,7 +222,7 @@ def _check_horizon(study: Study) -> None:
             "planners = ['rollout'] or []"
         )
     for algorithm in study.algorithms:
-        check_end(algorithm, study.params.end)
+        check_end(algorithm, study.params.end, getattr(study, algorithm).observation)
 
 
 def _check_algorithms(study: Study) -> None:

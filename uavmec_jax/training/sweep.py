@@ -86,7 +86,7 @@ def train(
     """Train one agent on each of ``A`` scenarios, all of them as one program.
 
     Args:
-        algorithm: ``dqn``, ``ppo`` or ``a2c``.
+        algorithm: ``dqn``, ``pqn``, ``ppo`` or ``a2c``.
         scenarios: leaves ``[A, ...]``, e.g. from ``jax.vmap(um.make_scenario)``. Each scenario may have its own layout,
             parameters and reward.
         key: source of all randomness; agent ``i`` has the ``i``-th key split from it.
@@ -98,13 +98,13 @@ def train(
 
     Raises:
         StudyError: an unknown algorithm, hyperparameter or setting, a wrong number of values, too little memory, several
-            UAVs or depots, or a DQN where episodes go on after a failure.
+            UAVs or depots, or a DQN on the paper's observation where episodes go on after a failure.
         AssertionError: the scenarios are not a batch.
     """
     if algorithm not in ALGORITHMS:
         raise StudyError(f"algorithm is {algorithm!r}; {suggest(algorithm, ALGORITHMS)}")
     chex.assert_rank(scenarios.layout.capacity, 2)
-    _check_scenarios(algorithm, scenarios)
+    _check_scenarios(algorithm, scenarios, (settings or {}).get("observation", "paper"))
     registered, validation = ALGORITHMS[algorithm], validation or Validation()
     n, n_devices = scenarios.layout.capacity.shape
     max_age = int(np.max(scenarios.params.data_age_limit_slots)) + 1
@@ -121,11 +121,11 @@ def train(
     return TrainedPopulation(bound, batched_hyper, _concatenate(list(shards)))
 
 
-def _check_scenarios(algorithm: str, scenarios: Scenario) -> None:
+def _check_scenarios(algorithm: str, scenarios: Scenario, observation: str) -> None:
     """Check that an algorithm can train on scenarios."""
     try:
         check_one_uav(scenarios.layout, "training")
-        check_end(algorithm, scenarios.params.end)
+        check_end(algorithm, scenarios.params.end, observation)
     except ValueError as error:
         raise StudyError(str(error)) from None
 
