@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from tests.populations import take
 from tests.small_scenarios import mid_life
-from uavmec_jax.agents import ppo, pqn
+from uavmec_jax.agents import dqn, ppo, pqn
 from uavmec_jax.agents.equivariant_networks import ABSENT_LOGIT, sum_over_devices
 from uavmec_jax.agents.observation_spec import OBSERVATIONS
 from uavmec_jax.env.layout import pad_layout
@@ -88,6 +88,17 @@ def test_permuting_devices_permutes_the_q_values(n):
         values, order = np.asarray(q_values(params, layout, state)), rng.permutation(n)
         assert np.ptp(values) > 0.01
         assert_array_equal(q_values(params, *permuted(order, layout, state)), values[order])
+
+
+def test_dqn_and_pqn_have_the_same_network():
+    spec = dqn.DQNSpec(hidden=(16, 24), observation="full", layer_norm=True)
+    assert (spec.network, spec.obs_size) == (Q_SPEC.network, Q_SPEC.obs_size)
+    params, layout, state = mid_life(0, spec.n_devices)
+    observation = OBSERVATIONS["full"].observation_fn(params, layout, state)
+    values = dqn.q_values(spec, dqn.DQNHyper(age_scale=7.0), initial_q_weights(), observation)
+    assert_allclose(values, q_values(params, layout, state), rtol=1e-5)
+    twice = dqn.greedy_action(spec, dqn.DQNHyper(), initial_q_weights(), jnp.stack([observation] * 2)[:, None])
+    assert_array_equal(twice, np.full((2, 1), np.argmax(values)))
 
 
 @pytest.mark.bits

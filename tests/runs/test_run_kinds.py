@@ -30,11 +30,19 @@ def test_resuming_needs_the_reward_function_again(tmp_path):
     assert again.run["reward_function"].endswith("survival")
 
 
-@pytest.mark.parametrize("algorithm", ["dqn", "ppo", "pqn"])
-def test_a_stopped_run_of_any_algorithm_is_resumed_with_the_same_bits(tmp_path, algorithm):
+@pytest.mark.parametrize(
+    ("algorithm", "observation"), [("dqn", "paper"), ("dqn", "full"), ("ppo", "paper"), ("pqn", "paper")]
+)
+def test_a_stopped_run_of_any_algorithm_is_resumed_with_the_same_bits(tmp_path, algorithm, observation):
     settings = {"ppo": {"n_steps": 32, "batch_size": 32}, "pqn": {"n_envs": 4, "n_steps": 8, "batch_size": 16}}
     changes = {f"{algorithm}.{name}": size for name, size in settings.get(algorithm, {}).items()}
-    changes |= {"algorithm": algorithm, "steps": 1500, "axes.powered": [8], f"{algorithm}.hidden": [8]}
+    changes |= {
+        f"{algorithm}.observation": observation,
+        "algorithm": algorithm,
+        "steps": 1500,
+        "axes.powered": [8],
+        f"{algorithm}.hidden": [8],
+    }
     study = parse_study(TINY, "tiny", changes)
     run_study(study, tmp_path / "whole", command="x")
     often = RunOptions(checkpoint_every_s=0.0)

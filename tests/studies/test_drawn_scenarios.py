@@ -100,23 +100,23 @@ def test_study_round_trip():
             "scenarios.typical_devices is 7; params.n_devices, 6, is the most",
         ),
         ("seeds = 2", "seeds = 2\npowered = [4]", "axes.powered is given, and scenarios too"),
-        ('algorithm = "ppo"', 'algorithm = "dqn"', "algorithm is 'dqn', which trains on one scenario"),
         ("steps = 64", 'steps = 64\nplace = "albany"', "place is given, and scenarios too"),
         ('observation = "full"', 'observation = "all"', "ppo.observation is 'all'"),
     ],
 )
 def test_bad_setting_is_refused_in_one_line(old, new, words):
     text = TOML.replace(old, new)
-    if "dqn" in new:
-        text = text[: text.index("[ppo]")] + text[text.index("[evaluation]") :]
     with pytest.raises(StudyError) as error:
         study_of(text)
     assert words in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def pqn_text():
-    return TOML.replace("ppo", "pqn")
+def text_of(name):
+    text = TOML.replace("ppo", name)
+    if name == "dqn":
+        text = text.replace("n_envs = 4\nn_steps = 8\n", "").replace("n_epochs = 1\n", "learning_starts = 8\n")
+    return text
 
 
 @pytest.mark.slow
@@ -144,12 +144,13 @@ def test_an_episode_that_ends_is_followed_by_one_in_a_fresh_scenario(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("observation", ["full", "paper"])
-def test_pqn_trains_on_drawn_scenarios(tmp_path, observation):
-    text = pqn_text().replace('observation = "full"', f'observation = "{observation}"')
+@pytest.mark.parametrize("name", ["dqn", "pqn"])
+def test_q_learning_on_drawn_scenarios(tmp_path, name, observation):
+    text = text_of(name).replace('observation = "full"', f'observation = "{observation}"')
     results = run_study(study_of(text), tmp_path / "run")
     assert_array_equal(results.agents["diverged_at"], -1)
     policy = load_policy(tmp_path / "run", seed=1)
-    assert policy.algorithm == "pqn"
+    assert policy.algorithm == name
     for n in (3, 12) if observation == "full" else (6,):
         params = Params(n_devices=n)
         layout = sample_layout(jax.random.key(n), params, 1, 1)

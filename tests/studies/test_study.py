@@ -174,7 +174,7 @@ BAD = [
     ),
     (
         {"params.end": "horizon", "evaluation.planners": []},
-        "bad.toml: params.end is 'horizon', and algorithm is 'dqn', whose replay holds no ages beyond their limit; give",
+        "bad.toml: params.end is 'horizon', and algorithm is 'dqn', whose replay of the paper's observation holds no ages",
     ),
     ({"evaluation.beam_width": 0}, "bad.toml: evaluation.beam_width is 0; it should be greater than or equal to 1"),
     ({"evaluation.planner_draws": 0}, "bad.toml: evaluation.planner_draws is 0; it should be greater"),

@@ -93,6 +93,7 @@ def test_fleets_and_a_dqn_with_a_horizon_are_refused(scenarios):
         um.train("ppo", two, key=key, steps=100)
     on = scenarios.replace(params=scenarios.params.replace(end="horizon"))
     with pytest.raises(
-        um.UserError, match=r"params\.end is 'horizon', and algorithm is 'dqn', whose replay holds no ages"
+        um.UserError,
+        match=r"params\.end is 'horizon', and algorithm is 'dqn', whose replay of the paper's observation holds no ages",
     ):
         um.train("dqn", on, key=key, steps=100)

@@ -126,7 +126,12 @@ class DQNSpec:
         """The replay buffer; its capacity is cut to the number of steps, which changes nothing."""
         steps = self.iterations * self.train_frequency
         capacity, wraps = min(self.replay_capacity, steps), self.replay_capacity < steps
-        shape = {"n_devices": self.n_devices, "capacity": capacity, "stride": self.train_frequency, "n_step": self.n_step}
+        shape = {
+            "n_devices": self.n_devices,
+            "capacity": capacity,
+            "stride": self.train_frequency,
+            "n_step": self.n_step,
+        }
         if self.sees_paper:
             return replay.ReplaySpec(**shape, wraps=wraps, max_age=self.max_age)
         return state_replay.StateReplaySpec(**shape, wraps=wraps)

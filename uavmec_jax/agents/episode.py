@@ -53,7 +53,9 @@ def start(agent: Agent, ring_size: int) -> RunningEpisode | None:
     return RunningEpisode(number=number, scenario=scenario, ring=ring)
 
 
-def follow(agent: Agent, episode: RunningEpisode | None, ended: Bool[Array, ""], played: Int[Array, ""]) -> RunningEpisode | None:
+def follow(
+    agent: Agent, episode: RunningEpisode | None, ended: Bool[Array, ""], played: Int[Array, ""]
+) -> RunningEpisode | None:
     """Return the next episode, in a newly drawn scenario, if the running one has ``ended``.
 
     Args:

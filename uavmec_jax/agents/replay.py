@@ -175,9 +175,7 @@ def pack(
     return jnp.concatenate([bits(battery_fraction, jnp.uint32), ages, bits(reward, jnp.uint32)[None], tag[None]])
 
 
-def flags_word(
-    word: UInt[Array, ""], terminated: Bool[Array, ""], ended: Bool[Array, ""]
-) -> UInt[Array, ""]:
+def flags_word(word: UInt[Array, ""], terminated: Bool[Array, ""], ended: Bool[Array, ""]) -> UInt[Array, ""]:
     """Return a row's last word: ``word``, which is less than :data:`MAX_ACTIONS`, and the flags."""
     word = word | jnp.where(terminated, TERMINATED, 0).astype(jnp.uint32)
     return word | jnp.where(ended, ENDED, 0).astype(jnp.uint32)
