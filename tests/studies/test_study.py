@@ -182,6 +182,11 @@ BAD = [
 ]
 
 
+def test_a_dqn_with_the_full_observation_takes_a_horizon():
+    changes = {"params.end": "horizon", "evaluation.planners": [], "dqn.observation": "full"}
+    assert load_study("table5", changes).params.end == "horizon"
+
+
 @pytest.mark.parametrize(("change", "message"), BAD, ids=[message[10:50] for _, message in BAD])
 def test_bad_setting_is_refused_in_one_line(change, message):
     with pytest.raises(StudyError) as error:

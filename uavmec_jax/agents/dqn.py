@@ -219,11 +219,12 @@ def _act(
     ended = terminated | is_truncated(scenario, after, outcome)
     if share is not None:  # log-uniform between the spread and 1
         share = jnp.where(ended, agent.hyper.exploration_spread ** uniform[n + 1], share)
-    if spec.sees_paper:
-        row = replay.pack(spec.replay, action, reward, after.battery / layout.capacity, after.age, terminated, ended)
+    buffer = spec.replay
+    if isinstance(buffer, replay.ReplaySpec):
+        row = replay.pack(buffer, action, reward, after.battery / layout.capacity, after.age, terminated, ended)
     else:
         number = jnp.int32(0) if state.episode is None else state.episode.number
-        row = state_replay.pack(spec.replay, action, reward, after, number, terminated, ended)
+        row = state_replay.pack(buffer, action, reward, after, number, terminated, ended)
     running = episode.follow(agent, state.episode, ended, steps_done + 1)
     next_scenario = episode.scenario_of(agent, running)
     state = replace(
@@ -241,10 +242,11 @@ def _sample(
     spec: DQNSpec, agent: Agent, state: DQNState, steps_done: Int[Array, ""], bits: UInt[Array, " B"]
 ) -> replay.Transition:
     """Sample a minibatch; ``bits`` has one uniform word for each sample."""
-    arguments = spec.replay, state.buffer_state, steps_done, bits, agent.hyper.gamma
-    if spec.sees_paper:
-        return replay.sample(*arguments)
+    buffer, arguments = spec.replay, (state.buffer_state, steps_done, bits, agent.hyper.gamma)
+    if isinstance(buffer, replay.ReplaySpec):
+        return replay.sample(buffer, *arguments)
     return state_replay.sample(
+        buffer,
         *arguments,
         oldest=episode.oldest_transition(state.episode),
         scenario_of=partial(episode.kept_scenario, agent, state.episode),

@@ -1,10 +1,10 @@
 """The episode that an agent with a replay plays: in a scenario of its own, if the agent has a distribution.
 
 The scenarios of the last ``M`` episodes are kept in a ring, one row of 32-bit words each, because samples of the replay need
-them. A row also says with which transition its episode began, so :func:`oldest_transition` tells which samples to leave alone.
+them. A row also says with which transition its episode began: samples are not older than the oldest of these transitions
+(:func:`oldest_transition`), so a scenario that has been overwritten is never looked up.
 """
 
-from dataclasses import replace
 from typing import Any
 
 import jax

@@ -5,8 +5,8 @@ transition is that of the previous row, or the initial one if an episode ended t
 neighbouring rows (two cache lines) instead of five scattered arrays, and 75 agents with 1,000,000 transitions each fit in
 4.5 GiB. Battery fractions and rewards are stored exactly; ages are small integers and are packed.
 
-The functions are pure; ``buffer_state`` is the array of all rows. :func:`add`, :func:`sample_rows` and :func:`flags_word` also
-serve the rows of :mod:`uavmec_jax.agents.state_replay`, whose last two words are the reward and the flags, too.
+The functions are pure; ``buffer_state`` is the array of all rows. :func:`add`, :func:`sample_rows` and :func:`flags_word`
+also serve the rows of :mod:`uavmec_jax.agents.state_replay`, whose last two words are the reward and the flags, too.
 """
 
 from dataclasses import dataclass
