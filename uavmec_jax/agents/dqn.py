@@ -137,8 +137,8 @@ def q_values(
     if spec.sees_paper:
         values: Any = spec.network.apply(weights, scale_ages(observation, hyper.age_scale))
         return values
-    values = spec.network.apply(weights, observation.reshape(-1, spec.obs_size))
-    return values.reshape(*observation.shape[:-1], spec.n_devices)
+    values = spec.network.apply(weights, observation.reshape(-1, observation.shape[-1]))
+    return values.reshape(*observation.shape[:-1], -1)
 
 
 def greedy_action(
