@@ -43,11 +43,11 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "no average": {"pqn.average_weights": False},
     "gamma 0.98": {"pqn.gamma": 0.98},
     "ages not scaled": {"pqn.age_scale": 1.0},
-    "four epochs, half the steps": {"pqn.n_epochs": 4, "steps": 300_000},
-    "one epoch, twice the steps": {"pqn.n_epochs": 1, "steps": 1_200_000},
+    "four epochs, half the steps": {"pqn.n_epochs": 4, "steps": 600_000},
+    "one epoch, twice the steps": {"pqn.n_epochs": 1, "steps": 2_400_000},
     "128-128": {"pqn.hidden": [128, 128]},
-    "half the steps": {"steps": 300_000},
-    "a quarter of the steps": {"steps": 150_000},
+    "half the steps": {"steps": 600_000},
+    "a quarter of the steps": {"steps": 300_000},
     "reward of the paper": {"reward": "U+log(A/O)", "slot_reward": 0.0, "pqn.gamma": 0.98},
 }
 """Variants of the study, by name: what they change."""

@@ -50,7 +50,7 @@ class PQNHyper:
     """Share of an action's disadvantage that is subtracted from its target (advantage learning); 0 is plain Q-learning."""
     exploration_highest_eps: Scalar = struct.field(default=0.95, metadata={"gt": 0, "le": 1})
     """Epsilon of the first environment; those of the others are spread logarithmically, and none changes."""
-    exploration_lowest_eps: Scalar = struct.field(default=0.05, metadata={"gt": 0, "le": 1})
+    exploration_lowest_eps: Scalar = struct.field(default=0.02, metadata={"gt": 0, "le": 1})
     """Epsilon of the last environment."""
     guidance: Scalar = struct.field(default=0.9, metadata={"ge": 0, "le": 1})
     """Share of the exploratory actions that follow the guide, if there is one."""
