@@ -23,9 +23,10 @@ from uavmec_jax.training import host
 
 AXES = {
     "cells": [[12, 6], [10, 10], [10, 4], [8, 8], [8, 4], [6, 12], [4, 6]],
-    "seeds": [2_000_000 + k for k in range(8)],
 }
-"""Counts of powered and connected devices, and seeds of layouts."""
+"""Counts of powered and connected devices."""
+FIRST_SEED = 2_000_000
+"""Of the layouts."""
 CELL = ["powered", "connected"]
 VARIANTS: dict[str, dict[str, Any]] = {
     "300,000 steps": {},
@@ -56,6 +57,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=Path, default=Path("runs/ablation"), help="folder of the runs")
+    parser.add_argument("--seeds", type=int, default=8, help="layouts in each of the seven cells")
     parser.add_argument("--steps", type=int, help="of every variant, for a test of the script")
     parser.add_argument("--variants", nargs="+", choices=list(VARIANTS), default=list(VARIANTS))
     parser.add_argument("--out", type=Path, default=Path("results/table5-best"))
@@ -77,7 +79,8 @@ def main() -> None:
 
 def run(arguments: argparse.Namespace, name: str, changes: dict[str, Any]) -> Results:
     """Run the study with some changes, or go on with its run."""
-    draws = {"axes": AXES, "evaluation.draws": 20, "evaluation.planner_draws": 20}
+    seeds = list(range(FIRST_SEED, FIRST_SEED + arguments.seeds))
+    draws = {"axes": AXES | {"seeds": seeds}, "evaluation.draws": 20, "evaluation.planner_draws": 20}
     changes = {"steps": 300_000} | changes | ({"steps": arguments.steps} if arguments.steps else {})
     changes = {key: value for key, value in changes.items() if value is not None}
     study = load_study("table5-best", changes | draws)
