@@ -1,4 +1,4 @@
-"""What each piece of the best Q-learner is worth: `table5-best` with one setting changed at a time.
+"""What each piece of the best Q-learner is worth: `table5-best` with 300,000 steps and one setting changed at a time.
 
     uv run python experiments/q_ablation.py [--runs runs/ablation] [--out results/table5-best]
 
@@ -23,12 +23,13 @@ from uavmec_jax.training import host
 
 AXES = {
     "cells": [[12, 6], [10, 10], [10, 4], [8, 8], [8, 4], [6, 12], [4, 6]],
-    "seeds": [2_000_000 + k for k in range(8)],
 }
-"""Counts of powered and connected devices, and seeds of layouts."""
+"""Counts of powered and connected devices."""
+FIRST_SEED = 2_000_000
+"""Of the layouts."""
 CELL = ["powered", "connected"]
 VARIANTS: dict[str, dict[str, Any]] = {
-    "the study": {},
+    "300,000 steps": {},
     "guide: oldest-first": {"pqn.guide": "oldest-first"},
     "guide: none": {"pqn.guide": "none"},
     "half of the exploration guided": {"pqn.guidance": 0.5},
@@ -43,11 +44,11 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "no average": {"pqn.average_weights": False},
     "gamma 0.98": {"pqn.gamma": 0.98},
     "ages not scaled": {"pqn.age_scale": 1.0},
-    "four epochs, half the steps": {"pqn.n_epochs": 4, "steps": 300_000},
-    "one epoch, twice the steps": {"pqn.n_epochs": 1, "steps": 1_200_000},
+    "four epochs, half the steps": {"pqn.n_epochs": 4, "steps": 150_000},
+    "one epoch, twice the steps": {"pqn.n_epochs": 1, "steps": 600_000},
     "128-128": {"pqn.hidden": [128, 128]},
-    "half the steps": {"steps": 300_000},
-    "a quarter of the steps": {"steps": 150_000},
+    "600,000 steps": {"steps": 600_000},
+    "1,200,000 steps: the study": {"steps": 1_200_000},
     "reward of the paper": {"reward": "U+log(A/O)", "slot_reward": 0.0, "pqn.gamma": 0.98},
 }
 """Variants of the study, by name: what they change."""
@@ -56,6 +57,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=Path, default=Path("runs/ablation"), help="folder of the runs")
+    parser.add_argument("--seeds", type=int, default=8, help="layouts in each of the seven cells")
     parser.add_argument("--steps", type=int, help="of every variant, for a test of the script")
     parser.add_argument("--variants", nargs="+", choices=list(VARIANTS), default=list(VARIANTS))
     parser.add_argument("--out", type=Path, default=Path("results/table5-best"))
@@ -77,9 +79,9 @@ def main() -> None:
 
 def run(arguments: argparse.Namespace, name: str, changes: dict[str, Any]) -> Results:
     """Run the study with some changes, or go on with its run."""
-    draws = {"axes": AXES, "evaluation.draws": 20, "evaluation.planner_draws": 20}
-    if arguments.steps:
-        changes = changes | {"steps": arguments.steps}
+    seeds = list(range(FIRST_SEED, FIRST_SEED + arguments.seeds))
+    draws = {"axes": AXES | {"seeds": seeds}, "evaluation.draws": 20, "evaluation.planner_draws": 20}
+    changes = {"steps": 300_000} | changes | ({"steps": arguments.steps} if arguments.steps else {})
     changes = {key: value for key, value in changes.items() if value is not None}
     study = load_study("table5-best", changes | draws)
     return run_or_resume(study, arguments.runs / name, command="uv run python experiments/q_ablation.py")

@@ -182,6 +182,15 @@ def test_altered_file_is_refused(run, tmp_path, change, message):
     assert str(error.value) == f"{tmp_path / 'other.npz'}: {message}"
 
 
+def test_settings_newer_than_the_file_have_their_defaults(run, tmp_path):
+    stored = read_policies(run / "weights.npz")
+    older = {name: value for name, value in stored.settings["dqn"].items() if name not in ("layer_norm", "gap")}
+    write_policies(tmp_path / "old.npz", replace(stored, settings={"dqn": older}))
+    observations = np.linspace(0, 1, 240, dtype=np.float32).reshape(10, 24)
+    old, new = load_policy(tmp_path / "old.npz", **AGENT), load_policy(run, **AGENT)
+    assert_array_equal(old.act(observations), new.act(observations))
+
+
 def test_weights_that_are_not_finite_are_refused(run, tmp_path):
     collection = read_policies(run / "weights.npz")
     key = "dqn/best/params/TorchDense_0/kernel"

@@ -6,4 +6,6 @@ from .dqn import DQNHyper as DQNHyper
 from .dqn import DQNSpec as DQNSpec
 from .ppo import PPOHyper as PPOHyper
 from .ppo import PPOSpec as PPOSpec
+from .pqn import PQNHyper as PQNHyper
+from .pqn import PQNSpec as PQNSpec
 from .registry import ALGORITHMS as ALGORITHMS

@@ -38,6 +38,14 @@ class RegisteredAlgorithm:
         names = (field.name for field in dataclasses.fields(self.spec))
         return tuple(name for name in names if name not in SCENARIO_SETTINGS)
 
+    @property
+    def defaults(self) -> dict[str, Any]:
+        """The defaults of all settings, traced and static."""
+        hyper, spec = self.hyper(), self.spec()
+        return {name: getattr(hyper, name) for name in self.traced} | {
+            name: getattr(spec, name) for name in self.static
+        }
+
     def spec_of(self, settings: Mapping[str, Any], **sizes: int) -> Any:
         """Return the static settings: those in ``settings`` and, of ``sizes``, those that the algorithm has.
 

@@ -70,12 +70,13 @@ class PolicyCollection:
         return ALGORITHMS[name].spec_of(self._settings(name), n_devices=self.n_devices)
 
     def _settings(self, name: str) -> dict[str, Any]:
-        """Return the settings of an algorithm with JSON's arrays as tuples."""
-        return {key: tuple(value) if isinstance(value, list) else value for key, value in self.settings[name].items()}
+        """Return the settings of an algorithm, JSON's arrays as tuples; settings newer than the file have their defaults."""
+        stored = {key: tuple(value) if isinstance(value, list) else value for key, value in self.settings[name].items()}
+        return ALGORITHMS[name].defaults | stored
 
     def hyper(self, name: str, agent: Mapping[str, Any]) -> Any:
         """Return the hyperparameters of one agent."""
-        values, registered = dict(self.settings[name]) | dict(agent), ALGORITHMS[name]
+        values, registered = self._settings(name) | dict(agent), ALGORITHMS[name]
         return registered.hyper(**{key: values[key] for key in registered.traced})
 
     def pick(self, axes: Mapping[str, Any]) -> tuple[str, int]:

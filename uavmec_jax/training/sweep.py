@@ -134,7 +134,7 @@ def _bind(
     registered: RegisteredAlgorithm, settings: Mapping[str, Any], steps: int, n_devices: int, max_age: int
 ) -> Algorithm:
     """Return the algorithm with its static settings bound; those not given have their defaults."""
-    defaults = {name: getattr(registered.spec(), name) for name in registered.static}
+    defaults = {name: registered.defaults[name] for name in registered.static}
     for name in settings:
         if name not in defaults:
             raise StudyError(f"settings has {name!r}; {suggest(name, defaults)}")
