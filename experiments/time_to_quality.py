@@ -32,8 +32,8 @@ SHARES = (0.90, 0.95, 0.97, 0.98)
 LEARNERS: dict[str, tuple[str, dict[str, Any]]] = {
     "PQN (table5-best)": ("table5-best", {}),
     "PQN, 300,000 steps": ("table5-best", {"steps": 300_000}),
-    "PQN, exploration guided by oldest-first": ("table5-best", {"pqn.guide": "oldest-first"}),
-    "PQN, exploration not guided": ("table5-best", {"pqn.guide": "none"}),
+    "PQN, 300,000 steps, guided by oldest-first": ("table5-best", {"pqn.guide": "oldest-first", "steps": 300_000}),
+    "PQN, 300,000 steps, not guided": ("table5-best", {"pqn.guide": "none", "steps": 300_000}),
     "DQN (table5-best-dqn)": ("table5-best-dqn", {}),
     "DQN (the paper's settings)": ("table5", {"steps": 300_000}),
     "PPO, paid one per slot": ("table5", {"algorithm": "ppo", "reward": {}, "slot_reward": 1.0, "steps": 300_000}),
