@@ -7,7 +7,7 @@ import click
 from uavmec_jax.cli.advise import advise
 from uavmec_jax.cli.common import InputError
 from uavmec_jax.cli.machine import doctor
-from uavmec_jax.cli.runs import resume, status, submit, worker
+from uavmec_jax.cli.runs import resume, status
 from uavmec_jax.cli.scenarios import evaluate, plan
 from uavmec_jax.cli.search import search
 from uavmec_jax.cli.studies import compare, run, show, validate
@@ -53,7 +53,7 @@ def main() -> None:
 
 
 _COMMANDS = (
-    *(run, resume, status, worker, submit, search),
+    *(run, resume, status, search),
     *(advise, plan, evaluate, show, compare, validate, traffic, doctor),
 )
 

@@ -9,10 +9,27 @@ from typing import Any
 import click
 
 from uavmec_jax.cli.common import InputError, assignment
+from uavmec_jax.cluster.options import RayOptions
 from uavmec_jax.runs.options import CHECKPOINT_KINDS, RunOptions
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON on standard output.")
 out_option = functools.partial(click.option, "--out", type=click.Path(path_type=Path))
+
+
+class FolderOfRun(click.ParamType):
+    """A folder on this machine, or the URL of one in an object store."""
+
+    name = "folder"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the path."""
+        from uavmec_jax.files.locations import to_path
+
+        return to_path(value)
+
+
+run_folder_option = functools.partial(click.option, "--out", type=FolderOfRun())
+directory_argument = click.argument("directory", type=FolderOfRun())
 set_option = functools.partial(click.option, "--set", "settings", multiple=True, metavar="NAME=VALUE")
 
 _DEFAULT_COUNT = 8
@@ -107,12 +124,6 @@ def run_options(command: Callable) -> Callable:
     default = RunOptions()
     options = (
         click.option(
-            "--workers",
-            type=click.IntRange(1, 256),
-            default=1,
-            help="Number of processes on this machine (default: 1).",
-        ),
-        click.option(
             "--shard-size", type=click.IntRange(1), help="Most agents in a shard (default: as many as caches hold)."
         ),
         click.option(
@@ -134,13 +145,62 @@ def run_options(command: Callable) -> Callable:
             default=default.checkpoint_share,
             help=f"Largest share of the time spent on checkpoints (default: {default.checkpoint_share:g}).",
         ),
-        click.option(
-            "--lease",
-            "lease_s",
-            type=click.FloatRange(1),
-            default=default.lease_s,
-            help=f"Seconds until a worker without heartbeat counts as dead (default: {default.lease_s:g}).",
-        ),
         click.option("--tensorboard", is_flag=True, help="Also write TensorBoard event files (needs tensorboardX)."),
     )
     return _add_options(command, options)
+
+
+def ray_options(command: Callable) -> Callable:
+    """Add the options that put the work on Ray; the command receives a :class:`RayOptions` or ``None`` as ``ray``."""
+    default = RayOptions()
+    options = (
+        click.option(
+            "--ray",
+            "address",
+            is_flag=False,
+            flag_value="",
+            metavar="[ADDRESS]",
+            help="Put the shards on Ray: on the cluster at ADDRESS (host:port, ray://host:port, auto), else on that of "
+            "RAY_ADDRESS, else on one that is started on this machine (local). Give it last, or with an address.",
+        ),
+        click.option(
+            "--cpus-per-shard", type=click.IntRange(1), help="With --ray: cores of a shard (default: this machine's)."
+        ),
+        click.option(
+            "--gpus-per-shard", type=click.IntRange(0), default=0, help="With --ray: GPUs of a shard (default: 0)."
+        ),
+        click.option(
+            "--resource",
+            "resources",
+            multiple=True,
+            metavar="NAME=AMOUNT",
+            help="With --ray: a custom resource that a shard needs.",
+        ),
+        click.option(
+            "--retries",
+            type=click.IntRange(0),
+            default=default.retries,
+            help="With --ray: how often a shard is tried again after an error of the program; nodes that die do not "
+            f"count (default: {default.retries}).",
+        ),
+        click.option(
+            "--time-limit",
+            "time_limit_s",
+            type=click.FloatRange(1),
+            help="With --ray: seconds after which an attempt at a shard is ended and made anew from its checkpoint.",
+        ),
+    )
+
+    def decorate(address: str | None, resources: tuple[str, ...], **others: Any) -> Any:
+        names = ("cpus_per_shard", "gpus_per_shard", "retries", "time_limit_s")
+        needs = {name: others.pop(name) for name in names}
+        amounts = dict(assignment(text, "--resource") for text in resources)
+        for name, amount in amounts.items():
+            if isinstance(amount, bool) or not isinstance(amount, int | float) or not amount > 0:
+                raise InputError(f"--resource {name}={amount}: the amount must be a positive number")
+        ray = None if address is None else RayOptions(address=address or None, resources=amounts, **needs)
+        if ray is None and (amounts or needs != {name: getattr(default, name) for name in names}):
+            raise InputError("--cpus-per-shard, --gpus-per-shard, --resource, --retries and --time-limit need --ray")
+        return command(ray=ray, **others)
+
+    return _add_options(functools.wraps(command)(decorate), options)

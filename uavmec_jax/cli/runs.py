@@ -1,7 +1,7 @@
-"""Commands about existing runs: resume, status, and workers that share a run."""
+"""Commands about existing runs: resume and status."""
 
-import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,23 +10,19 @@ import click
 from uavmec_jax.cli.common import (
     InputError,
     Interrupt,
-    assignment,
-    command_line,
-    new_folder,
     print_json,
     print_results,
 )
-from uavmec_jax.cli.options import json_option, out_option, run_options, set_option
+from uavmec_jax.cli.options import directory_argument, json_option, ray_options
+from uavmec_jax.cluster.options import RayOptions
 from uavmec_jax.runs.options import RunOptions
-
-directory_argument = click.argument("directory", type=click.Path(path_type=Path))
 
 _EVENTS = {
     "damaged": "shard {shard}: {error}; the file is renamed and not used",
     "restored": "shard {shard} resumes from {file}, step {steps:,}",
     "failed": "shard {shard} failed: {error}",
-    "lost": "{error}",
-    "died": "worker {pid} died (exit code {exit_code}); the others take over",
+    "lost": "shard {shard}: its process or node is lost ({error}); it is tried again",
+    "retried": "shard {shard}: {error}; it is tried again",
 }
 """Events of a run that are printed, and how."""
 
@@ -59,14 +55,17 @@ def report_results(results: Any, directory: Path, console: Any, as_json: bool) -
 
 @click.command()
 @directory_argument
+@ray_options
 @click.option(
-    "--workers", type=click.IntRange(1, 256), help="Number of processes on this machine (default: as planned)."
+    "--take-over",
+    is_flag=True,
+    help="Resume although the folder names a process on another machine as its owner, which is dead.",
 )
 @click.option(
     "--other-code", is_flag=True, help="Resume although code or libraries have changed; the results may differ."
 )
 @json_option
-def resume(directory: Path, workers: int | None, other_code: bool, as_json: bool) -> None:
+def resume(directory: Path, ray: Any, take_over: bool, other_code: bool, as_json: bool) -> None:
     """Resume the run in DIRECTORY after it was stopped or killed; the results are those of an uninterrupted run."""
     from uavmec_jax.training import host
 
@@ -80,12 +79,14 @@ def resume(directory: Path, workers: int | None, other_code: bool, as_json: bool
     console = Console(stderr=as_json)
     plan = RunFolder.open(directory).plan
     console.print(f"[bold]{directory}[/bold]: {plan}", soft_wrap=True)
-    with progress_bar(console, plan) as on_progress:
+    with progress_bar(console) as bar:
+        bar.start(plan)
         results = resume_run(
             directory,
-            workers=workers,
+            ray=ray,
+            take_over=take_over,
             other_code=other_code,
-            on_progress=on_progress,
+            on_progress=bar.report,
             on_event=event_printer(console),
         )
     report_results(results, directory, console, as_json)
@@ -109,102 +110,12 @@ def status(directory: Path, as_json: bool) -> None:
         Console().print(line, highlight=False, soft_wrap=True)
 
 
-@click.command()
-@directory_argument
-@click.option("--share", metavar="I/N", help="Use the I-th of N equal parts of this machine's cores.")
-@click.option(
-    "--no-wait", is_flag=True, help="End when no shard is free, instead of waiting to take over from dead workers."
-)
-def worker(directory: Path, share: str | None, no_wait: bool) -> None:
-    """Join the workers of the run in DIRECTORY, on this machine or on any that shares the folder."""
-    from uavmec_jax.training import host
-
-    host.use_all_cores(_share(share))
-    from rich.console import Console
-
-    from uavmec_jax.runs.shared_run import work_on
-    from uavmec_jax.runs.signals import Interrupted
-
-    try:
-        complete = work_on(directory, wait=not no_wait, on_event=event_printer(Console()))
-    except Interrupted as stop:
-        raise Interrupt(
-            f"progress is saved; start a worker again with: uavmec worker {directory}", stop.signal
-        ) from stop
-    click.echo(f"{directory}: {'complete' if complete else 'no shard is free; some are still running or have failed'}")
-
-
-def _share(text: str | None) -> tuple[int, int] | None:
-    """Parse ``I/N``, numbers from 1."""
-    if text is None:
-        return None
-    part, slash, parts = text.partition("/")
-    if not slash or not part.isdigit() or not parts.isdigit() or not 1 <= int(part) <= int(parts):
-        raise InputError(f"--share {text}: give I/N, e.g. 1/2 for the first half of the cores")
-    return int(part), int(parts)
-
-
-@click.command()
-@click.argument("study")
-@click.option(
-    "--jobs", type=click.IntRange(1, 10_000), required=True, help="Number of workers to start on the cluster."
-)
-@click.option("--executor", default="slurm", help="Executor of submitit: slurm, local or debug (default: slurm).")
-@click.option(
-    "--with",
-    "parameters",
-    multiple=True,
-    metavar="NAME=VALUE",
-    help="Parameter of submitit, e.g. --with slurm_partition=cpu.",
-)
-@set_option(help="Override any setting, as in `uavmec run`.")
-@out_option(help="Folder of the run, which all machines must share.")
-@run_options
-def submit(
-    study: str,
-    jobs: int,
-    executor: str,
-    parameters: tuple[str, ...],
-    settings: tuple[str, ...],
-    out: Path | None,
-    workers: int,
-    shard_size: int | None,
-    **options: Any,
-) -> None:
-    """Plan STUDY and submit workers for it to a cluster (SLURM) by submitit: pip install 'uavmec-jax[cluster]'."""
-    from uavmec_jax.training import host
-
-    host.use_all_cores()
-    from uavmec_jax.runs.cluster import submit_workers
-    from uavmec_jax.runs.shared_run import prepare_run
-    from uavmec_jax.studies.study import load_study
-
-    resolved = load_study(study, dict(assignment(setting) for setting in settings))
-    directory = out or new_folder(resolved.name)
-
-    def prepare() -> Path:
-        prepare_run(
-            resolved,
-            directory,
-            command=command_line(),
-            workers=workers,
-            shard_size=shard_size,
-            jobs=jobs,
-            options=RunOptions(**options),
-        )
-        return directory.absolute()
-
-    names = submit_workers(prepare, jobs, executor, dict(assignment(text, "--with") for text in parameters))
-    click.echo(f"{directory}: {len(names)} workers submitted ({', '.join(names[:4])}{', ...' * (len(names) > 4)})")
-    click.echo(f"progress: uavmec status {directory}; results, once complete: uavmec show {directory}")
-
-
 def print_simulation(
     study: Any,
     speed: float | None,
     devices: int | None,
-    workers: int,
     shard_size: int | None,
+    ray: RayOptions | None,
     options: RunOptions,
     as_json: bool,
 ) -> None:
@@ -213,7 +124,8 @@ def print_simulation(
     Raises:
         InputError: no speed is given.
     """
-    from uavmec_jax.runs.run_plan import plan_run
+    from uavmec_jax.cluster.connection import devices_per_shard
+    from uavmec_jax.runs.run_plan import Machine, plan_run
     from uavmec_jax.runs.simulate import simulate
 
     if speed is None:
@@ -221,8 +133,13 @@ def print_simulation(
             "--simulate needs --speed, the training steps per second of one device: training_steps_per_second in the "
             "run.json of an earlier run, divided by its devices"
         )
-    plan = plan_run(study, workers=workers, shard_size=shard_size)
-    estimate = simulate(study, plan, speed=speed, devices=devices or os.cpu_count() or 1, options=options)
+    machine = Machine.here()
+    if ray is not None:
+        machine = replace(machine, devices=devices_per_shard(ray), accelerator=ray.gpus_per_shard > 0)
+    plan = plan_run(study, shard_size=shard_size, machine=machine)
+    estimate = simulate(
+        study, plan, speed=speed, devices=devices or machine.devices, options=options, on_ray=ray is not None
+    )
     if as_json:
         print_json(estimate.as_json())
     else:

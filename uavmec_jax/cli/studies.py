@@ -6,8 +6,16 @@ from typing import Any
 import click
 
 from uavmec_jax.cli.common import assignment, command_line, new_folder, print_json, print_results, print_tables
-from uavmec_jax.cli.options import json_option, out_option, run_options, set_option
-from uavmec_jax.cli.runs import directory_argument, event_printer, print_simulation, report_results
+from uavmec_jax.cli.options import (
+    FolderOfRun,
+    directory_argument,
+    json_option,
+    ray_options,
+    run_folder_option,
+    run_options,
+    set_option,
+)
+from uavmec_jax.cli.runs import event_printer, print_simulation, report_results
 from uavmec_jax.runs.options import RunOptions
 
 QUICK_STEPS, QUICK_SEEDS, QUICK_VALIDATE_EVERY = 50_000, 3, 5_000
@@ -21,9 +29,10 @@ QUICK_STEPS, QUICK_SEEDS, QUICK_VALIDATE_EVERY = 50_000, 3, 5_000
     "--quick", is_flag=True, help=f"{QUICK_SEEDS} seeds x {QUICK_STEPS:,} steps: first results within a minute."
 )
 @set_option(help="Override any setting, e.g. --set dqn.gamma=0.99 or --set axes.learning_rate=[0.001,0.0071].")
-@out_option(help="Folder of the run (default: runs/<study>-<time>).")
+@run_folder_option(help="Folder of the run, a path or a URL such as s3://bucket/run (default: runs/<study>-<time>).")
 @json_option
 @run_options
+@ray_options
 @click.option("--simulate", is_flag=True, help="Estimate wall time, disk space and memory, and run nothing.")
 @click.option("--speed", type=float, help="For --simulate: training steps per second of one device.")
 @click.option("--devices", type=int, help="For --simulate: number of devices (default: those of this machine).")
@@ -38,8 +47,8 @@ def run(
     simulate: bool,
     speed: float | None,
     devices: int | None,
-    workers: int,
     shard_size: int | None,
+    ray: Any,
     **options: Any,
 ) -> None:
     """Train and evaluate STUDY: one that ships with the package (table5, table6, table7, planning, ...) or a TOML file."""
@@ -53,27 +62,30 @@ def run(
     from uavmec_jax.reporting.progress import progress_bar
     from uavmec_jax.runs.results_folder import check_directory
     from uavmec_jax.runs.run import run_study
-    from uavmec_jax.runs.run_plan import plan_run
     from uavmec_jax.studies.study import load_study
 
     console = Console(stderr=as_json)
     resolved = load_study(study, overrides)
     if simulate:
-        print_simulation(resolved, speed, devices, workers, shard_size, RunOptions(**options), as_json)
+        print_simulation(resolved, speed, devices, shard_size, ray, RunOptions(**options), as_json)
         return
     directory = out or new_folder(resolved.name)
     check_directory(directory)
-    plan = plan_run(resolved, workers=workers, shard_size=shard_size)
-    console.print(f"[bold]{resolved.name}[/bold]: {plan}")
-    with progress_bar(console, plan) as on_progress:
+    with progress_bar(console) as bar:
+
+        def on_plan(plan: Any) -> None:
+            console.print(f"[bold]{resolved.name}[/bold]: {plan}")
+            bar.start(plan)
+
         results = run_study(
             resolved,
             directory,
             command=command_line(),
-            workers=workers,
+            ray=ray,
             shard_size=shard_size,
             options=RunOptions(**options),
-            on_progress=on_progress,
+            on_plan=on_plan,
+            on_progress=bar.report,
             on_event=event_printer(console),
         )
     report_results(results, directory, console, as_json)
@@ -107,8 +119,8 @@ def show(directory: Path, as_json: bool) -> None:
 
 
 @click.command()
-@click.argument("run_a", type=click.Path(path_type=Path))
-@click.argument("run_b", type=click.Path(path_type=Path))
+@click.argument("run_a", type=FolderOfRun())
+@click.argument("run_b", type=FolderOfRun())
 @click.option("--a", "where_a", multiple=True, metavar="NAME=VALUE", help="Which agents of A, e.g. --a algorithm=dqn.")
 @click.option("--b", "where_b", multiple=True, metavar="NAME=VALUE", help="Which agents of B.")
 @click.option("--policy-a", default="best", help="Policy of A: best, last, oldest-first, ... (default: best).")

@@ -1,12 +1,15 @@
 """Atomic writes: a file is replaced by a complete new one, or left as it was."""
 
 import os
+import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+
+from uavmec_jax.files.locations import file_system, is_local
 
 
 def write_text(path: Path, text: str) -> None:
@@ -21,6 +24,19 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], *, compressed: bo
     _write(path, lambda file: save(file, **named))
 
 
+def create_exclusively(path: Path, content: bytes) -> bool:
+    """Create a small file if there is none, and return whether it was created; of several processes, one succeeds."""
+    try:
+        if is_local(path):
+            with path.open("xb") as file:
+                file.write(content)
+        else:
+            file_system(path).pipe_file(path.path, content, mode="create")  # type: ignore[attr-defined]
+    except FileExistsError:
+        return False
+    return True
+
+
 def _write(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:
     with atomic(path) as partial, partial.open("wb") as file:
         fill(file)
@@ -30,13 +46,26 @@ def _write(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:
 
 @contextmanager
 def atomic(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside ``path``, with the same suffix, for the caller to write.
+    """Yield a temporary path of this machine, with the same suffix, for the caller to write.
 
-    On success the temporary file replaces ``path``. After an exception it is removed, and ``path`` is as before.
+    On success the temporary file replaces ``path``. After an exception it is removed, and ``path`` is as before. Beside
+    a local ``path``; an object store gets the whole file at once, as one object.
     """
-    partial = path.with_name(f".{path.stem}.part{path.suffix}")
-    try:
+    if is_local(path):
+        partial = path.with_name(f".{path.stem}.part{path.suffix}")
+        try:
+            yield partial
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
+        return
+    with tempfile.TemporaryDirectory(prefix="uavmec-") as folder:
+        partial = Path(folder) / path.name
         yield partial
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+        file_system(path).put_file(str(partial), path.path)  # type: ignore[attr-defined]
+
+
+def set_aside(path: Path) -> None:
+    """Rename a damaged file, so that it is not read again; another process may have done so before."""
+    with suppress(FileNotFoundError):
+        path.rename(path.with_suffix(".damaged"))

@@ -5,7 +5,7 @@ import datetime
 from uavmec_jax.runs.status import Status
 
 _MAX_LINES = 8
-"""Workers and failures that are listed."""
+"""Nodes, running shards and failures that are listed, each."""
 
 
 def status_lines(status: Status) -> list[str]:
@@ -21,10 +21,15 @@ def status_lines(status: Status) -> list[str]:
     if status.seconds_left is not None:
         left = datetime.timedelta(seconds=round(status.seconds_left))
         lines.append(f"speed: {status.steps_per_second:,.0f} steps/s, training left: {left}")
-    lines += _truncate(status.workers)
+    if status.retries:
+        lines.append(f"attempts that were repeated: {status.retries:,}")
+    if len(status.nodes) > 1:
+        lines += _truncate([f"node {node}: {count} shards" for node, count in status.nodes.items()])
+    lines += _truncate(status.running)
     lines += _truncate([f"shard {number} failed: {why}" for number, why in status.failures.items()])
-    if not status.complete and not status.workers:
-        lines.append(f"no worker is running; resume with: uavmec resume {status.directory}")
+    if not status.complete:
+        resume = f"nobody is working on it; resume with: uavmec resume {status.directory}"
+        lines.append(f"carried out by {status.owner}" if status.owner else resume)
     return lines
 
 

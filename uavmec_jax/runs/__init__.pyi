@@ -4,8 +4,6 @@ from .run import resume_run as resume_run
 from .run import run_study as run_study
 from .run_plan import RunPlan as RunPlan
 from .run_plan import plan_run as plan_run
-from .shared_run import prepare_run as prepare_run
-from .shared_run import work_on as work_on
 from .simulate import Simulation as Simulation
 from .simulate import simulate as simulate
 from .status import Status as Status

@@ -8,6 +8,8 @@ from typing import Any
 
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files.archives import open_checked, write_checked
+from uavmec_jax.files.writing import set_aside
+from uavmec_jax.runs.folder import CHECKPOINT
 from uavmec_jax.runs.options import CheckpointKind
 from uavmec_jax.scenarios.policy_files import PolicyCollection, write_policies
 from uavmec_jax.training.training import Training
@@ -45,6 +47,7 @@ class Checkpoints:
         share: largest share of the time that writing may take.
         bytes: approximate size of one.
         identity: the run and the shard, which a checkpoint must name to be restored.
+        attempt: name of the attempt at the shard that writes.
         log_event: called with ``(event, **facts)``.
         collect: turns weights into the policies that a ``weights`` checkpoint holds.
     """
@@ -55,6 +58,7 @@ class Checkpoints:
     share: float
     bytes: int
     identity: dict[str, Any]
+    attempt: str
     log_event: Callable[..., None]
     collect: Callable[[dict[str, Any]], PolicyCollection]
     _last: float = field(default_factory=time.monotonic)
@@ -72,7 +76,7 @@ class Checkpoints:
             OSError: the file cannot be written; earlier checkpoints are untouched.
         """
         started = time.monotonic()
-        path = self._next_path()
+        path = self.folder / f"{CHECKPOINT}-{training.chunks_done:06d}-{self.attempt}.npz"
         if self.kind == "weights":
             write_policies(path, self.collect(training.weights(self.identity["agents"])))
         else:
@@ -97,7 +101,7 @@ class Checkpoints:
                 progress = self._restore(path, training)
             except StudyError as error:
                 self.log_event("damaged", file=path.name, error=str(error))
-                path.rename(path.with_suffix(".damaged"))
+                set_aside(path)
                 training = start()
                 continue
             for activity, spent in progress["seconds"].items():
@@ -115,13 +119,9 @@ class Checkpoints:
 
     def remove(self) -> None:
         """Remove all checkpoints, once the shard is finished."""
-        for path in [*self._generations(), *self.folder.glob("checkpoint-*.damaged")]:
+        for path in [*self._generations(), *self.folder.glob(f"{CHECKPOINT}-*.damaged")]:
             path.unlink(missing_ok=True)
 
-    def _next_path(self) -> Path:
-        numbers = [int(path.stem.removeprefix("checkpoint-")) for path in self.folder.glob("checkpoint-[0-9]*.*")]
-        return self.folder / f"checkpoint-{max(numbers, default=0) + 1:06d}.npz"
-
     def _generations(self) -> list[Path]:
-        """Return the checkpoints, the newest first."""
-        return sorted(self.folder.glob("checkpoint-*.npz"), reverse=True)
+        """Return the checkpoints of all attempts, the furthest first: after as many chunks, all hold the same state."""
+        return sorted(self.folder.glob(f"{CHECKPOINT}-*.npz"), reverse=True)

@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import secrets
+import time
 from collections.abc import Iterator
 from dataclasses import asdict
 from functools import cached_property
@@ -9,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from uavmec_jax.errors import StudyError
-from uavmec_jax.files.leases import is_stale, read_lease
+from uavmec_jax.files.locks import is_known_dead
 from uavmec_jax.files.reading import read_json_or_empty, read_text
 from uavmec_jax.files.writing import write_text
 from uavmec_jax.runs.options import RunOptions
@@ -20,10 +22,18 @@ from uavmec_jax.studies.study import parse_study, study_toml
 from uavmec_jax.training import host
 from uavmec_jax.training.partition import Partition
 
-SCHEMA = 1
+SCHEMA = 2
 """Version of the run plan's file."""
 
+_WITH_LEASES = 1
+"""Version whose workers shared a run by leases; its finished runs are read, the others are not continued."""
+
+_SILENCE_S = 600.0
+"""Seconds without a report after which an attempt elsewhere is shown as stopped."""
+
 RUN_PLAN, LOG, SHARDS, TOUR = "run_plan.json", "log", "shards", "tour.json"
+CHECKPOINT, PROGRESS, RESULT, FAILURE = "checkpoint", "progress", "result", "failed.json"
+"""What an attempt at a shard writes, under its own name, and why the shard failed."""
 
 ShardState = Literal["waiting", "running", "stopped", "failed", "done"]
 
@@ -75,7 +85,9 @@ class RunFolder:
             schema, digest = facts["schema"], facts["sha256"]
         except (ValueError, KeyError, TypeError) as error:
             raise StudyError(f"{file}: cannot be read: {error!r}; plan the study anew in another folder") from None
-        if schema != SCHEMA:
+        if schema == _WITH_LEASES and not (path / RUN).is_file():
+            raise StudyError(f"{path}: was started by a version whose workers held leases; finish it with that version")
+        if schema not in (SCHEMA, _WITH_LEASES):
             raise StudyError(f"{file}: schema is {schema!r}; this version reads {SCHEMA}")
         if digest != _digest(facts):
             raise StudyError(f"{file}: was altered or damaged: it does not fit its SHA-256; plan the study anew")
@@ -91,7 +103,7 @@ class RunFolder:
     @cached_property
     def plan(self) -> RunPlan:
         """How the study is partitioned."""
-        facts = dict(self.facts["plan"])
+        facts = {name: value for name, value in self.facts["plan"].items() if name != "workers"}
         facts["partitions"] = {name: Partition(**fields) for name, fields in facts["partitions"].items()}
         return RunPlan(**facts)
 
@@ -145,33 +157,55 @@ class RunFolder:
 
     @property
     def shards_folder(self) -> Path:
-        """Where the shards are until the run is complete; whoever started or resumed the run holds its lease."""
+        """Where the shards are until the run is complete; whoever started or resumed the run holds its lock."""
         return self.path / SHARDS
 
     def shard_folder(self, shard: Shard) -> Path:
-        """Return the folder of a shard, which is created when the shard is claimed."""
+        """Return the folder of a shard, which is created with its first attempt."""
         return self.shards_folder / f"{shard.number:05d}"
-
-    def result(self, shard: Shard) -> Path:
-        """Return the file of a finished shard."""
-        return self.shard_folder(shard) / "result.npz"
 
     def failure(self, shard: Shard) -> Path:
         """Return the file that says why a shard failed."""
-        return self.shard_folder(shard) / "failed.json"
+        return self.shard_folder(shard) / FAILURE
+
+    def results(self, shard: Shard) -> list[Path]:
+        """Return the results of a shard: one from each attempt that finished it, all with the same contents."""
+        return sorted(self.shard_folder(shard).glob(f"{RESULT}-*.npz"))
+
+    def is_closed(self, shard: Shard) -> bool:
+        """Return whether a shard is finished or has failed."""
+        return self.complete or bool(self.results(shard)) or self.failure(shard).exists()
+
+    def new_attempt(self, shard: Shard) -> str:
+        """Return a name for another attempt at a shard, under which it writes: its number, and what makes it unique."""
+        before = len(list(self.shard_folder(shard).glob(f"{PROGRESS}-*.json")))
+        return f"{before + 1:02d}-{secrets.token_hex(3)}"
 
     def states(self) -> Iterator[tuple[Shard, ShardState, dict[str, Any]]]:
-        """Yield every shard with its state and what its worker last reported: progress, or why it failed."""
+        """Yield every shard with its state and what its latest attempt last reported: progress, or why it failed."""
         complete = self.complete
+        files: dict[str, list[Path]] = {}
+        for file in () if complete else self.shards_folder.glob("*/*"):
+            files.setdefault(file.parent.name, []).append(file)
         for shard in self.plan.shards:
-            if complete or self.result(shard).exists():
-                yield shard, "done", {}
-            elif self.failure(shard).exists():
-                yield shard, "failed", read_json_or_empty(self.failure(shard))
-            elif lease := read_lease(self.shard_folder(shard)):
-                yield shard, "stopped" if is_stale(lease, self.options.lease_s) else "running", lease
+            present = sorted(files.get(f"{shard.number:05d}", ()), key=lambda file: file.name)
+            reports = [file for file in present if file.name.startswith(f"{PROGRESS}-")]
+            report = read_json_or_empty(reports[-1]) if reports else {}
+            report["attempts"] = len(reports)
+            if complete or any(file.name.startswith(f"{RESULT}-") for file in present):
+                yield shard, "done", report
+            elif any(file.name == FAILURE for file in present):
+                yield shard, "failed", report | read_json_or_empty(self.failure(shard))
+            elif reports:
+                yield shard, "running" if _is_running(report) else "stopped", report
             else:
                 yield shard, "waiting", {}
+
+
+def _is_running(report: dict[str, Any]) -> bool:
+    """Return whether an attempt goes on, as far as its last report tells; for display only."""
+    silent = time.time() - report.get("at", 0) > _SILENCE_S
+    return report.get("state") == "running" and not silent and not is_known_dead(report)
 
 
 def _sha256(text: str) -> str:

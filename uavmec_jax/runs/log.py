@@ -6,11 +6,16 @@ import logging
 import os
 import socket
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
-from uavmec_jax.training import host
+from uavmec_jax.files.extras import optional
+from uavmec_jax.files.locations import is_local
+from uavmec_jax.files.writing import write_text
 
 OnEvent = Callable[[str, dict[str, Any]], None]
 
@@ -22,7 +27,12 @@ class RunLog:
     """Logs the events of one process that works on a run."""
 
     def __init__(
-        self, folder: Path, *, tensorboard: bool = False, on_event: OnEvent = lambda event, facts: None
+        self,
+        folder: Path,
+        *,
+        tensorboard: bool = False,
+        on_event: OnEvent = lambda event, facts: None,
+        context: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
         """Open the log.
 
@@ -30,18 +40,25 @@ class RunLog:
             folder: folder of the log files; created when the first event is logged.
             tensorboard: whether curves are also written as TensorBoard event files, beside the folder.
             on_event: called with every event and its facts.
+            context: facts that are added to every event, such as the node.
 
         Raises:
             StudyError: ``tensorboard`` is set and tensorboardX is not installed.
         """
         self._logger = logging.Logger("uavmec_jax.run", logging.INFO)
-        self._logger.addHandler(_JsonLinesHandler(folder / f"{socket.gethostname()}-{os.getpid()}.jsonl"))
+        self._context = dict(context)
+        name = f"{socket.gethostname()}-{os.getpid()}"
+        if is_local(folder):
+            self._logger.addHandler(_JsonLinesHandler(folder / f"{name}.jsonl"))
+        else:  # objects cannot be appended to: each log is one that is written anew
+            self._logger.addHandler(_JsonObjectHandler(folder / f"{name}-{time.time_ns():x}.jsonl"))
         if tensorboard:
             self._logger.addHandler(_TensorBoardHandler(folder.parent / "tensorboard"))
         self._on_event = on_event
 
     def event(self, name: str, **facts: Any) -> None:
         """Log an event with its facts, which JSON must be able to hold."""
+        facts |= self._context
         self._logger.info(name, extra={"facts": facts})
         self._on_event(name, facts)
 
@@ -91,6 +108,37 @@ class _JsonLinesHandler(logging.FileHandler):
             self.handleError(record)
 
 
+class _JsonObjectHandler(logging.Handler):
+    """Writes lines into one object of a store, all of them again every time; while that fails, the run goes on."""
+
+    _EVERY_S = 30.0
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.setFormatter(_JsonFormatter())
+        self._path = path
+        self._lines: list[str] = []
+        self._written = time.monotonic()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep a line, and write all of them if the last time was long ago."""
+        self._lines.append(self.format(record) + "\n")
+        if time.monotonic() - self._written > self._EVERY_S:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write all lines."""
+        self._written = time.monotonic()
+        with suppress(OSError):
+            write_text(self._path, "".join(self._lines))
+
+    def close(self) -> None:
+        """Write all lines for the last time."""
+        if self._lines:
+            self.flush()
+        super().close()
+
+
 class _TensorBoardHandler(logging.Handler):
     """Writes curves as TensorBoard event files, one folder per shard."""
 
@@ -106,6 +154,7 @@ class _TensorBoardHandler(logging.Handler):
             return
         facts: dict[str, Any] = dict(record.facts)  # type: ignore[attr-defined]
         shard, steps = facts.pop("shard"), facts.pop("steps")
+        facts = {name: value for name, value in facts.items() if not isinstance(value, str)}  # the node is no curve
         if shard not in self._writers:
             self._writers[shard] = self._writer_class(str(self._folder / f"shard-{shard:05d}"))
         for name, value in facts.items():
@@ -125,4 +174,4 @@ def tensorboard_writer() -> Any:
     Raises:
         StudyError: it is not installed.
     """
-    return host.optional("tensorboardX", "--tensorboard", "tensorboard").SummaryWriter
+    return optional("tensorboardX", "--tensorboard", "tensorboard").SummaryWriter

@@ -17,12 +17,10 @@ class RunOptions:
         checkpoint: what a checkpoint of a shard in training holds.
         checkpoint_every_s: least seconds between two checkpoints.
         checkpoint_share: largest share of the time spent on checkpoints: large ones are written less often.
-        lease_s: seconds without a heartbeat after which a worker on another machine counts as dead.
         tensorboard: whether curves are also written as TensorBoard event files.
     """
 
     checkpoint: CheckpointKind = "full"
     checkpoint_every_s: float = 60.0
     checkpoint_share: float = 0.02
-    lease_s: float = 60.0
     tensorboard: bool = False

@@ -1,12 +1,13 @@
 """Results of runs: assembled from their shards, and loaded again, complete or partial."""
 
-import shutil
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 from uavmec_jax.errors import StudyError
-from uavmec_jax.files.leases import Leases, describe_holder
+from uavmec_jax.files.locations import remove_folder, to_path
+from uavmec_jax.files.locks import describe_process, owner_of
+from uavmec_jax.files.writing import set_aside
 from uavmec_jax.runs.folder import RUN_PLAN, SHARDS, TOUR, RunFolder
 from uavmec_jax.studies.population import cell_axes
 from uavmec_jax.studies.results import RUN, STUDY, Results
@@ -20,13 +21,13 @@ def check_directory(directory: Path) -> None:
     Raises:
         StudyError: it is not empty, another process works in it, or it is a file.
     """
-    if (holder := Leases().holder(directory / SHARDS)) is not None:
-        raise StudyError(f"{directory}: {describe_holder(holder)} is working in it{worker_hint(directory)}")
+    if (owner := owner_of(directory / SHARDS)) is not None:
+        raise StudyError(f"{directory}: {describe_process(owner)} is working in it")
     check_empty(directory)
 
 
 def check_empty(directory: Path) -> None:
-    """Refuse a folder that holds anything but leases.
+    """Refuse a folder that holds anything but a lock.
 
     Raises:
         StudyError: it holds a run, a tour or other files, or is a file.
@@ -39,11 +40,6 @@ def check_empty(directory: Path) -> None:
         raise StudyError(f"{directory}: already holds a tour of `uavmec plan`; give another folder with --out")
     if directory.exists() and not (directory.is_dir() and all(file.name == SHARDS for file in directory.iterdir())):
         raise StudyError(f"{directory}: exists and is not an empty folder; give another one with --out")
-
-
-def worker_hint(directory: Path) -> str:
-    """Return how to join the workers of a run, as the end of a message."""
-    return f"; to help it, start `uavmec worker {directory}`"
 
 
 def assemble_results(folder: RunFolder, shards: Iterable[ShardResult], **more: Any) -> Results:
@@ -66,36 +62,28 @@ def assemble_results(folder: RunFolder, shards: Iterable[ShardResult], **more: A
             f"{folder.path}: its shards hold {len(results.agents):,} agents; the plan has {folder.plan.agents:,}, each once"
         )
     results.save(folder.path)
-    shutil.rmtree(folder.shards_folder, ignore_errors=True)
+    remove_folder(folder.shards_folder)
     return results
-
-
-def finished_shards(folder: RunFolder) -> list[ShardResult]:
-    """Read the results of the shards that are finished so far.
-
-    Raises:
-        StudyError: the file of a shard is damaged.
-    """
-    return [ShardResult.read(folder.result(shard)) for shard, state, _ in folder.states() if state == "done"]
 
 
 def read_finished_shards(folder: RunFolder, log_event: Callable[..., None]) -> tuple[list[ShardResult], list[int]]:
     """Read the results of finished shards; log and rename damaged files, whose shards then are to be run again.
 
     Returns:
-        The intact results, and the numbers of the damaged shards.
+        The intact results, and the numbers of the shards that have none although they were finished.
     """
     intact, damaged = [], []
     for shard in folder.plan.shards:
-        path = folder.result(shard)
-        if not path.exists():
-            continue
-        try:
-            intact.append(ShardResult.read(path))
-        except StudyError as error:
-            log_event("damaged", shard=shard.number, file=path.name, error=str(error))
-            path.rename(path.with_suffix(".damaged"))
-            damaged.append(shard.number)
+        results = folder.results(shard)
+        for path in results:
+            try:
+                intact.append(ShardResult.read(path))
+                break
+            except StudyError as error:
+                log_event("damaged", shard=shard.number, file=path.name, error=str(error))
+                set_aside(path)
+        else:
+            damaged += [shard.number] * bool(results)
     return intact, damaged
 
 
@@ -105,7 +93,8 @@ def partial_results(folder: RunFolder) -> Results:
     Raises:
         StudyError: the file of a shard is damaged.
     """
-    return Results.of(folder.study, folder.facts["label"], finished_shards(folder), folder.plan.agents)
+    finished = [ShardResult.read(folder.results(shard)[0]) for shard, state, _ in folder.states() if state == "done"]
+    return Results.of(folder.study, folder.facts["label"], finished, folder.plan.agents)
 
 
 def load_results(directory: str | Path) -> Results:
@@ -116,7 +105,7 @@ def load_results(directory: str | Path) -> Results:
     Raises:
         StudyError: the folder holds no run, a file is damaged, or another version wrote it.
     """
-    directory = Path(directory)
+    directory = to_path(directory)
     if not (directory / RUN).exists() and (directory / RUN_PLAN).exists():
         return partial_results(RunFolder.open(directory))
     if not (directory / RUN).exists() and (directory / TOUR).exists():

@@ -1,16 +1,21 @@
-"""Run a study in one process or several, or resume a run, and assemble its results."""
+"""Run a study, in this process or on Ray, or resume a run, and assemble its results."""
 
-import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from uavmec_jax.cluster.connection import Cluster, connect
+from uavmec_jax.cluster.options import RayOptions
 from uavmec_jax.errors import StudyError
-from uavmec_jax.files.leases import Leases
-from uavmec_jax.runs.folder import RUN_PLAN, SHARDS, RunFolder
-from uavmec_jax.runs.log import OnEvent, tensorboard_writer
+from uavmec_jax.files.locations import remove_folder, to_path
+from uavmec_jax.files.locks import lock_folder
+from uavmec_jax.runs.folder import LOG, RUN_PLAN, SHARDS, RunFolder
+from uavmec_jax.runs.in_process import OnProgress, run_here
+from uavmec_jax.runs.log import OnEvent, RunLog, tensorboard_writer
+from uavmec_jax.runs.on_ray import probe_node, run_on_ray
 from uavmec_jax.runs.options import RunOptions
 from uavmec_jax.runs.results_folder import (
     assemble_results,
@@ -19,13 +24,10 @@ from uavmec_jax.runs.results_folder import (
     load_results,
     partial_results,
     read_finished_shards,
-    worker_hint,
 )
 from uavmec_jax.runs.run_plan import RunPlan, label_of, plan_run
 from uavmec_jax.runs.shard_runner import ShardRunner
 from uavmec_jax.runs.signals import StopSignal
-from uavmec_jax.runs.team import work_together
-from uavmec_jax.runs.worker import OnProgress, make_worker
 from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.studies.shard_result import ShardResult
@@ -40,9 +42,10 @@ def run_study(
     *,
     reward: RewardFunction | None = None,
     command: str | None = None,
-    workers: int = 1,
+    ray: RayOptions | str | bool | None = None,
     shard_size: int | None = None,
     options: RunOptions | None = None,
+    on_plan: Callable[[RunPlan], None] = lambda plan: None,
     on_progress: OnProgress = lambda _: None,
     on_event: OnEvent = lambda event, facts: None,
 ) -> Results:
@@ -53,64 +56,69 @@ def run_study(
 
     Args:
         study: from :func:`um.load_study`.
-        directory: folder of the run; ``None`` saves nothing.
+        directory: folder of the run, a path or a URL such as ``s3://bucket/run``; ``None`` saves nothing.
         reward: a function of the reward's terms (see :func:`um.make_reward`) that replaces the study's reward; the run's
             label then names it.
         command: the command line, for the label of the results.
-        workers: number of processes; more than one need a directory.
+        ray: put the shards on Ray: ``True`` for the cluster of ``RAY_ADDRESS``, else one on this machine; an address; or
+            options. All nodes must have the same version of this package, and reach the directory.
         shard_size: most agents in a shard; by default as many as the devices' caches hold.
         options: how the run is checkpointed and logged.
+        on_plan: called with the run plan before anything is trained.
         on_progress: called after every chunk.
         on_event: called with ``(event, facts)`` of everything that is logged.
 
     Raises:
         StudyError: the population does not fit in memory, the directory cannot take a run or another process works in it,
-            shards failed, ``reward`` is given beside an axis of rewards, or tensorboardX is needed and not installed.
+            shards failed, ``reward`` is given beside an axis of rewards, a package is not installed, Ray cannot be reached,
+            or is given without a directory or with a reward function.
     """
     if reward is not None and "reward" in study.axes:
         raise StudyError(f"{study.name}: axes.reward is given, and a reward function too; leave one of them out")
-    if workers > 1 and (directory is None or reward is not None):
-        raise StudyError(
-            f"{study.name}: workers is {workers}; several processes need a directory and no reward function"
-        )
-    if directory is not None:
-        check_directory(Path(directory))
-    plan = plan_run(study, workers=workers, shard_size=shard_size)
-    label = label_of(study, plan, command)
-    if reward is not None:
-        label["reward_function"] = getattr(reward, "__qualname__", repr(reward))
-    runner = ShardRunner(study, plan, reward)
-    if directory is None:
-        return _run_in_memory(study, plan, runner, label, on_progress)
-    path, options = Path(directory), options or RunOptions()
+    ray = RayOptions.of(ray)
+    if ray and (directory is None or reward is not None):
+        raise StudyError(f"{study.name}: a run on Ray needs a directory and no reward function")
+    path = None if directory is None else to_path(directory)
+    if path is not None:
+        check_directory(path)
+    options = options or RunOptions()
     if options.tensorboard:
         tensorboard_writer()
-    lease = Leases(options.lease_s).hold(path / SHARDS, path, worker_hint(path))
-    try:
-        check_empty(path)
-        RunFolder.create(path, study, plan, options, label)
-        return _run(path, runner, workers, on_progress, on_event)
-    finally:
-        lease.release()
+    with _connected(ray) as cluster:
+        machine = probe_node(cluster) if cluster else None
+        plan = plan_run(study, shard_size=shard_size, machine=machine)
+        on_plan(plan)
+        label = label_of(study, plan, command)
+        if reward is not None:
+            label["reward_function"] = getattr(reward, "__qualname__", repr(reward))
+        if path is None:
+            return _run_in_memory(study, plan, ShardRunner(study, plan, reward), label, on_progress)
+        with lock_folder(path / SHARDS, path):
+            check_empty(path)
+            folder = RunFolder.create(path, study, plan, options, label)
+            return _run(folder, reward, cluster, on_progress, on_event)
 
 
 def resume_run(
     directory: str | Path,
     *,
     reward: RewardFunction | None = None,
-    workers: int | None = None,
+    ray: RayOptions | str | bool | None = None,
+    take_over: bool = False,
     other_code: bool = False,
     on_progress: OnProgress = lambda _: None,
     on_event: OnEvent = lambda event, facts: None,
 ) -> Results:
     """Resume a run that was stopped or killed; its results are those of an uninterrupted run, to the bit.
 
-    Finished shards are kept, the others resume from their last intact checkpoint; failed shards are run again.
+    Finished shards are kept, the others resume from their last intact checkpoint; failed shards are run again. It does not
+    matter whether the run was started on Ray or not, and whether it is resumed there.
 
     Args:
-        directory: folder of the run.
+        directory: folder of the run, a path or a URL.
         reward: the reward function that the run was started with, if any.
-        workers: number of processes; by default as many as the run was planned for.
+        ray: as for :func:`run_study`.
+        take_over: resume although the folder names a process on another machine as its owner, which is dead.
         other_code: resume although code or libraries have changed since the run was planned; its label then says so.
         on_progress: called after every chunk.
         on_event: called with ``(event, facts)`` of everything that is logged.
@@ -119,62 +127,67 @@ def resume_run(
         StudyError: the directory holds no run, the run plan is damaged, another process works in it, or the run needs
             its reward function or was planned with other code.
     """
-    path = Path(directory)
+    path, ray = to_path(directory), RayOptions.of(ray)
     folder = RunFolder.open(path)
     folder.check_reward(reward)
     if folder.complete:
-        shutil.rmtree(folder.shards_folder, ignore_errors=True)
+        remove_folder(folder.shards_folder)
         return load_results(path)
+    if ray and reward is not None:
+        raise StudyError(f"{path}: a run on Ray takes no reward function")
     if not other_code:
         folder.check_code()
-    lease = Leases(folder.options.lease_s).hold(folder.shards_folder, path, worker_hint(path))
-    try:
+    with lock_folder(folder.shards_folder, path, take_over=take_over), _connected(ray) as cluster:
         for shard in folder.plan.shards:
             folder.failure(shard).unlink(missing_ok=True)
         label = {"other_code": differ} if (differ := folder.other_code()) else {}
-        runner = ShardRunner(folder.study, folder.plan, reward)
-        return _run(path, runner, workers or folder.plan.workers, on_progress, on_event, label)
-    finally:
-        lease.release()
+        return _run(folder, reward, cluster, on_progress, on_event, label)
 
 
 def run_or_resume(
     study: Study, directory: str | Path, *, command: str | None = None, on_progress: OnProgress = lambda _: None
 ) -> Results:
     """Run a study in a folder; if it holds a run, resume that, or load its results if it is complete."""
-    if (Path(directory) / RUN_PLAN).exists():
+    if (to_path(directory) / RUN_PLAN).exists():
         return resume_run(directory, on_progress=on_progress)
     return run_study(study, directory, command=command, on_progress=on_progress)
 
 
+@contextmanager
+def _connected(ray: RayOptions | None) -> Iterator[Cluster | None]:
+    """Connect to a cluster, if one is wanted."""
+    if ray is None:
+        yield None
+        return
+    with connect(ray) as cluster:
+        yield cluster
+
+
 def _run(
-    path: Path,
-    runner: ShardRunner,
-    workers: int,
+    folder: RunFolder,
+    reward: RewardFunction | None,
+    cluster: Cluster | None,
     on_progress: OnProgress,
     on_event: OnEvent,
     label: Mapping[str, Any] = MappingProxyType({}),
 ) -> Results:
     """Run all shards that are not finished, and assemble the results."""
+    log = RunLog(folder.path / LOG, tensorboard=folder.options.tensorboard and cluster is None, on_event=on_event)
     with StopSignal() as stop:
-        worker = make_worker(path, runner=runner, stop=stop, on_progress=on_progress, on_event=on_event)
-        folder = worker.folder
         try:
-            while True:
-                if workers > 1:
-                    work_together(folder, workers, stop, on_progress, worker.log.event)
+            damaged = None
+            while damaged is None or damaged:
+                if cluster is None:
+                    run_here(folder, ShardRunner(folder.study, folder.plan, reward), stop, log, on_progress)
                 else:
-                    worker.work()
-                finished, damaged = read_finished_shards(folder, worker.log.event)
-                if not damaged:
-                    break
-                worker.reopen(damaged)
+                    run_on_ray(folder, cluster, stop, log, on_progress, other_code=bool(label))
+                finished, damaged = read_finished_shards(folder, log.event)
         except KeyboardInterrupt as interrupt:
             results = partial_results(folder)
             results.run["stopped_by"] = getattr(interrupt, "signal", 2)
             return results
         finally:
-            worker.log.close()
+            log.close()
         _check_failures(folder)
         return assemble_results(folder, finished, **label)
 

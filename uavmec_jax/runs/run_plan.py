@@ -50,7 +50,6 @@ class RunPlan:
         partitions: part -> how its agents are partitioned.
         members: part -> number of its agents.
         steps: part -> environment steps of one agent, in whole iterations; 0 where nothing is trained.
-        workers: number of processes that the plan is made for.
         free_bytes: free memory when the plan was made.
     """
 
@@ -58,7 +57,6 @@ class RunPlan:
     partitions: dict[str, Partition]
     members: dict[str, int]
     steps: dict[str, int]
-    workers: int
     free_bytes: int
 
     @cached_property
@@ -91,29 +89,48 @@ class RunPlan:
         partitions, count = list(self.partitions.values()), len(self.shards)
         sizes = "+".join(f"{partition.shards} x {partition.shard_size}" for partition in partitions)
         of_size = f" ({sizes})" if len(partitions) > 1 else f" of {partitions[0].shard_size}"
-        needed = self.workers * max(partition.shard_bytes for partition in partitions)
+        needed = max(partition.shard_bytes for partition in partitions)
         memory = f"{needed / 2**30:.2f} GiB of {self.free_bytes / 2**30:.1f} GiB free"
         groups = max(partition.groups for partition in partitions)
         devices = f"{groups} device{'s' * (groups > 1)}"
-        devices = f"{self.workers} workers with {devices} each" if self.workers > 1 else devices
         steps = self.total_steps // self.agents
         return f"{self.agents:,} agents x {steps:,} steps in {count} shard{'s' * (count > 1)}{of_size} on {devices}, {memory}"
 
 
-def plan_run(study: Study, *, workers: int = 1, shard_size: int | None = None, jobs: int = 1) -> RunPlan:
+@dataclass(frozen=True)
+class Machine:
+    """What a shard has for its training, on this machine or on a node of a cluster.
+
+    Attributes:
+        devices: JAX devices.
+        accelerator: whether they are accelerators rather than cores.
+        free_bytes: memory of all of them together, see :func:`host.free_memory`.
+    """
+
+    devices: int
+    accelerator: bool
+    free_bytes: int
+
+    @classmethod
+    def here(cls) -> "Machine":
+        """Return this machine."""
+        return cls(jax.local_device_count(), jax.default_backend() != "cpu", host.free_memory())
+
+
+def plan_run(study: Study, *, shard_size: int | None = None, machine: Machine | None = None) -> RunPlan:
     """Estimate the memory of a study and cut its population into equal shards.
 
     Args:
         study: the study to run.
-        workers: processes on this host, which share its devices and its memory.
         shard_size: most agents in a shard; by default as many as the devices' caches hold.
-        jobs: workers on all hosts together; if there are enough agents, each has a shard.
+        machine: what a shard has; by default this machine.
 
     Raises:
         StudyError: the population does not fit in memory.
         TrafficError: the traffic of one of the study's places is not usable.
     """
     load_evacuations(study)
+    machine = machine or Machine.here()
     agents, free = n_agents(study), host.free_memory()
     needed = agents * BYTES_WITHOUT_TRAINING
     if needed > free:
@@ -126,23 +143,23 @@ def plan_run(study: Study, *, workers: int = 1, shard_size: int | None = None, j
     steps: dict[str, int] = {}
     for part in split_study(study):
         name, algorithm, count = part.name, make_algorithm(part.study), n_agents(part.study)
-        max_shard = min(shard_size or count, -(-count // max(workers, jobs)))
         members[name], steps[name] = count, algorithm.total_steps if algorithm else 0
         if algorithm is None:
-            size = min(_UNTRAINED_SHARD, max_shard)
+            size = min(_UNTRAINED_SHARD, shard_size or count, count)
             partitions[name] = Partition(shards=-(-count // size), shard_size=size, groups=1, shard_bytes=0)
             continue
         try:
             partitions[name] = partition_population(
                 count,
                 algorithm.agent_bytes,
-                (free - needed) // workers,
-                groups=max(jax.local_device_count() // workers, 1),
-                max_shard=max_shard if max_shard < count else None,
+                machine.free_bytes - needed,
+                groups=machine.devices,
+                max_shard=shard_size if shard_size and shard_size < count else None,
+                accelerator=machine.accelerator,
             )
         except PopulationTooLargeError as error:
             raise StudyError(f"{study.name}: steps is {study.steps}: {error}") from None
-    return RunPlan(agents=agents, partitions=partitions, members=members, steps=steps, workers=workers, free_bytes=free)
+    return RunPlan(agents=agents, partitions=partitions, members=members, steps=steps, free_bytes=machine.free_bytes)
 
 
 def label_of(study: Study, plan: RunPlan, command: str | None) -> dict[str, Any]:
@@ -156,7 +173,6 @@ def label_of(study: Study, plan: RunPlan, command: str | None) -> dict[str, Any]
         "agents": plan.agents,
         "seeds": seeds_of(study),
         **({"places": places} if (places := describe_places(study)) else {}),
-        "workers": plan.workers,
         "partitions": {name: asdict(partition) for name, partition in plan.partitions.items()},
         **host.describe(),
     }

@@ -19,6 +19,8 @@ from uavmec_jax.studies.schema import Study
 # Measured on two cores of a laptop-sized machine; see results/simulation.
 _START_S = 4.0
 """Start of a process, until it can compile."""
+_RAY_START_S = 7.0
+"""Start of Ray on this machine, and of its first worker."""
 _COMPILE_S = {"training": 9.0, "evaluation": 8.0, "planners": 9.0}
 """Compilation of one algorithm's programs."""
 _PLANNING_S = 0.035
@@ -80,6 +82,7 @@ def simulate(
     speed: float | Mapping[str, float],
     devices: int,
     options: RunOptions | None = None,
+    on_ray: bool = False,
 ) -> Simulation:
     """Estimate the wall time, disk space and memory of a run without running it.
 
@@ -89,6 +92,7 @@ def simulate(
         speed: training steps per second of one device, for all algorithms or by algorithm.
         devices: number of devices of all machines together.
         options: how the run would be checkpointed.
+        on_ray: whether Ray is started for it.
     """
     options = options or RunOptions()
     training = other = checkpoints = shards = results = 0.0
@@ -118,7 +122,7 @@ def simulate(
     largest = max(partition.shard_bytes for partition in plan.partitions.values())
     return Simulation(
         training_s=training,
-        other_s=_START_S + other,
+        other_s=_START_S + _RAY_START_S * on_ray + other,
         disk_bytes=shards + results + workers * checkpoints,
         result_bytes=results,
         memory_bytes=_PROCESS_BYTES + max(1.0 * largest, _COPIES * shards),

@@ -1,11 +1,12 @@
-"""The status of a run, read from its files alone."""
+"""The status of a run: shards, nodes, progress, speed, retries and time left, from its folder alone."""
 
 from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from uavmec_jax.files.leases import describe_holder
+from uavmec_jax.files.locations import file_system, is_local, to_path
+from uavmec_jax.files.locks import describe_process, owner_of
 from uavmec_jax.runs.folder import RunFolder
 
 
@@ -16,27 +17,33 @@ class Status:
     Attributes:
         directory: folder of the run.
         complete: whether the results have been assembled.
+        owner: the process that carries the run out, in words; empty if there is none.
         agents: number of agents.
         shards: state -> number of shards: ``waiting``, ``running``, ``stopped``, ``failed``, ``done``.
+        nodes: node -> number of shards that run there.
+        retries: attempts at shards beyond the first of each.
         steps: environment steps so far (scenarios, where nothing is trained).
         total_steps: environment steps of the whole run.
-        steps_per_second: training speed of all workers together; 0 if no shard is running.
+        steps_per_second: training speed of all running shards together; 0 if there are none.
         seconds_left: time left for training at that speed; ``None`` if no shard is running.
         disk_bytes: size of the folder.
-        workers: the running shards, and the process that works on each.
+        running: the running shards, and the process that works on each.
         failures: shard -> why it failed.
     """
 
     directory: str
     complete: bool
+    owner: str
     agents: int
     shards: dict[str, int]
+    nodes: dict[str, int]
+    retries: int
     steps: int
     total_steps: int
     steps_per_second: float
     seconds_left: float | None
     disk_bytes: int
-    workers: list[str]
+    running: list[str]
     failures: dict[int, str]
 
     def as_json(self) -> dict[str, Any]:
@@ -50,36 +57,50 @@ def run_status(directory: str | Path) -> Status:
     Raises:
         StudyError: the folder holds no run, or the run plan is damaged.
     """
-    folder = RunFolder.open(Path(directory))
+    folder = RunFolder.open(to_path(directory))
     plan = folder.plan
     counts: Counter[str] = Counter(waiting=0, running=0, stopped=0, failed=0, done=0)
-    steps, speed = 0, 0.0
-    workers, failures = [], {}
-    for shard, state, facts in folder.states():
+    nodes: Counter[str] = Counter()
+    steps, retries, speed = 0, 0, 0.0
+    running, failures = [], {}
+    for shard, state, report in folder.states():
         counts[state] += 1
+        retries += max(report.get("attempts", 0) - 1, 0)
         if state == "done":
             steps += plan.work_of(shard)
         elif state == "failed":
-            failures[shard.number] = str(facts.get("error", "an unknown error"))
+            failures[shard.number] = str(report.get("error", "an unknown error"))
         else:
-            steps += int(facts.get("steps", 0))
+            steps += int(report.get("steps", 0))
         if state == "running":
-            speed += float(facts.get("speed", 0.0))
-            workers.append(f"shard {shard.number}: {describe_holder(facts)}")
-    files = (file for file in folder.path.rglob("*") if file.is_file())
+            speed += float(report.get("speed", 0.0))
+            node = str(report.get("node", "an unknown node"))
+            nodes[node] += 1
+            running.append(f"shard {shard.number}: process {report.get('pid', '?')} on {node}")
+    owner = owner_of(folder.shards_folder)
     return Status(
         directory=str(directory),
         complete=folder.complete,
+        owner=describe_process(owner) if owner else "",
         agents=plan.agents,
         shards=dict(counts),
+        nodes=dict(nodes),
+        retries=retries,
         steps=steps,
         total_steps=plan.work,
         steps_per_second=speed,
         seconds_left=(plan.work - steps) / speed if speed else None,
-        disk_bytes=sum(_size(file) for file in files),
-        workers=workers,
+        disk_bytes=_size_of(folder.path),
+        running=running,
         failures=failures,
     )
+
+
+def _size_of(folder: Path) -> int:
+    """Return the size of all files in a folder."""
+    if not is_local(folder):
+        return int(file_system(folder).du(folder.path))  # type: ignore[attr-defined]
+    return sum(_size(file) for file in folder.rglob("*") if file.is_file())
 
 
 def _size(file: Path) -> int:

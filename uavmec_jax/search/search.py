@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from uavmec_jax.errors import StudyError
+from uavmec_jax.files.extras import optional
 from uavmec_jax.files.writing import write_text
 from uavmec_jax.search.halving import SuccessiveHalving, TrialOutcome
 from uavmec_jax.search.space import (
@@ -135,7 +136,7 @@ def best_study(result: SearchResult) -> Study:
 
 
 def _import_optuna() -> Any:
-    optuna = host.optional("optuna", "search", "search")
+    optuna = optional("optuna", "search", "search")
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     return optuna
 

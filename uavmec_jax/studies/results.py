@@ -21,7 +21,7 @@ from uavmec_jax.studies.measures import with_measures
 from uavmec_jax.studies.parts import split_study
 from uavmec_jax.studies.population import cell_axes
 from uavmec_jax.studies.schema import PLANNERS, Study
-from uavmec_jax.studies.shard_result import ShardResult
+from uavmec_jax.studies.shard_result import ShardResult, wall_seconds
 from uavmec_jax.studies.statistics import mean_interval
 from uavmec_jax.studies.study import study_toml
 
@@ -89,6 +89,7 @@ class Results:
         """
         results = cls(study, dict(label))
         seconds: dict[str, float] = {}
+        worked: list[tuple[float, float]] = []
         rows: list[pd.DataFrame] = []
         curves: dict[str, list[Mapping]] = {}
         evaluation, weights = [], []
@@ -100,18 +101,18 @@ class Results:
                 curves.setdefault(shard.algorithm, []).append(shard.curves)
                 weights.append(traverse_util.flatten_dict({shard.algorithm: shard.weights}, sep="/"))
             steps += shard.steps
+            worked.append(shard.worked)
             for activity, spent in shard.seconds.items():
                 seconds[activity] = seconds.get(activity, 0.0) + spent
         results.curves = {name: _concatenate(pieces) for name, pieces in curves.items()}
         results.evaluation, results.weights = _concatenate(evaluation), _concatenate(weights)
         if rows:
             results.agents = with_measures(study, pd.concat(rows, ignore_index=True), results.evaluation)
-        results._add_totals(agents, steps, seconds)
+        results._add_totals(agents, steps, seconds | {"wall": wall_seconds(worked)})
         return results
 
     def _add_totals(self, agents: int, steps: int, seconds: dict[str, float]) -> None:
-        """Add totals over the finished shards to ``run``; seconds are sums over all workers, except for the wall time."""
-        seconds = seconds | {"wall": seconds.get("wall", 0.0) / self.run.get("workers", 1)}
+        """Add totals over the finished shards to ``run``; seconds are sums over all shards, except for the wall time."""
         self.run |= {
             "complete": len(self.agents) == agents,
             "agents_done": len(self.agents),

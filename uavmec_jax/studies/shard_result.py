@@ -1,6 +1,8 @@
 """Results of one finished shard, in one checked file: rows, curves, evaluation and weights."""
 
-from dataclasses import dataclass
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,7 @@ from flax import traverse_util
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files.archives import read_checked, write_checked
 
-SHARD_SCHEMA = 1
+SHARD_SCHEMA = 2
 """Version of the file format."""
 
 _NUMBERS = "biuf"
@@ -28,6 +30,7 @@ class ShardResult:
         curves, evaluation, weights: as in :class:`uavmec_jax.studies.results.Results`, of this shard alone.
         seconds: time spent, by activity.
         steps: environment steps of all agents together.
+        ended_at: when it was finished, in seconds since the epoch.
     """
 
     algorithm: str
@@ -37,6 +40,12 @@ class ShardResult:
     weights: dict[str, Any]
     seconds: dict[str, float]
     steps: int
+    ended_at: float = field(default_factory=time.time)
+
+    @property
+    def worked(self) -> tuple[float, float]:
+        """When the attempt that finished it began and ended, in seconds since the epoch."""
+        return self.ended_at - self.seconds.get("wall", 0.0), self.ended_at
 
     def write(self, path: Path) -> None:
         """Write the results into one checked file, atomically."""
@@ -50,7 +59,8 @@ class ShardResult:
             for kind, tree in trees.items()
             for name, leaf in traverse_util.flatten_dict(tree, sep="/").items()
         }
-        facts = {"algorithm": self.algorithm, "seconds": self.seconds, "steps": self.steps, "columns": [*self.rows]}
+        facts = {"algorithm": self.algorithm, "seconds": self.seconds, "steps": self.steps}
+        facts |= {"columns": [*self.rows], "ended_at": self.ended_at}
         write_checked(path, SHARD_SCHEMA, facts, arrays, compressed=False)
 
     @classmethod
@@ -78,4 +88,14 @@ class ShardResult:
             weights=traverse_util.unflatten_dict(arrays_of("weights"), sep="/"),
             seconds=facts["seconds"],
             steps=facts["steps"],
+            ended_at=facts["ended_at"],
         )
+
+
+def wall_seconds(worked: Iterable[tuple[float, float]]) -> float:
+    """Return the time that intervals cover together, such as those in which shards were worked on."""
+    total, until = 0.0, float("-inf")
+    for first, last in sorted(worked):
+        total += max(last - max(first, until), 0.0)
+        until = max(until, last)
+    return total

@@ -1,7 +1,6 @@
 """The machine that a run is on: its cores, memory and software versions."""
 
 import hashlib
-import importlib
 import os
 import platform
 import sys
@@ -13,13 +12,11 @@ from typing import Any
 import jax
 import psutil
 
-from uavmec_jax.errors import StudyError
-
 MEMORY_SHARE = 0.8
 """Share of the free memory that a run may use."""
 
 
-def use_all_cores(share: tuple[int, int] | None = None) -> None:
+def use_all_cores(most: int | None = None) -> None:
     """Make every CPU core a JAX device. Call this before JAX is first used.
 
     Agents are split over the devices, so that each core works in its own cache. This is nearly twice as fast as a single
@@ -27,22 +24,13 @@ def use_all_cores(share: tuple[int, int] | None = None) -> None:
     has already set a number of devices.
 
     Args:
-        share: ``(i, n)``: use only the i-th of n equal parts of the cores (at least one core), counted from 1.
+        most: use no more cores than this.
     """
-    if hasattr(os, "sched_getaffinity"):
-        cores = sorted(os.sched_getaffinity(0))
-        if share is not None:
-            per_part = max(len(cores) // share[1], 1)
-            first = (share[0] - 1) * per_part % len(cores)
-            cores = cores[first : first + per_part]
-            os.sched_setaffinity(0, cores)
-        n_cores = len(cores)
-    else:
-        n_cores = max((os.cpu_count() or 1) // (share[1] if share else 1), 1)
+    n_cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
         return
     try:
-        jax.config.update("jax_num_cpu_devices", n_cores)
+        jax.config.update("jax_num_cpu_devices", min(n_cores, most or n_cores))
     except RuntimeError:  # the backend is already running
         return
 
@@ -97,25 +85,6 @@ def describe() -> dict[str, Any]:
         "backend": jax.default_backend(),
         "devices": [f"{device.platform}:{device.id} {device.device_kind}" for device in jax.local_devices()],
     }
-
-
-def optional(module: str, needed_by: str, extra: str) -> Any:
-    """Import and return a module of a package that is only installed with an extra.
-
-    Args:
-        module: name of the module.
-        needed_by: the command or option that needs it, for the message.
-        extra: the extra of this package that installs it.
-
-    Raises:
-        StudyError: it is not installed.
-    """
-    try:
-        return importlib.import_module(module)
-    except ImportError:
-        raise StudyError(
-            f"{needed_by} needs the package {module}, which is not installed: pip install 'uavmec-jax[{extra}]'"
-        ) from None
 
 
 def version(name: str) -> str:

@@ -49,7 +49,13 @@ class Partition:
 
 
 def partition_population(
-    n_agents: int, agent_bytes: int, memory_limit: int, *, groups: int | None = None, max_shard: int | None = None
+    n_agents: int,
+    agent_bytes: int,
+    memory_limit: int,
+    *,
+    groups: int | None = None,
+    max_shard: int | None = None,
+    accelerator: bool | None = None,
 ) -> Partition:
     """Partition ``n_agents`` agents into shards of equal size, each of which fits into ``memory_limit`` bytes.
 
@@ -59,12 +65,14 @@ def partition_population(
         memory_limit: memory of one shard, bytes.
         groups: number of groups in a shard; by default one per local device.
         max_shard: most agents in a shard; by default what the devices' caches hold.
+        accelerator: whether the devices are accelerators; by default, whether those of this process are.
 
     Raises:
         PopulationTooLargeError: one agent does not fit.
     """
     groups = min(groups or jax.local_device_count(), n_agents, max_shard or n_agents)
-    per_group = AGENTS_PER_CORE if jax.default_backend() == "cpu" else AGENTS_PER_ACCELERATOR
+    accelerator = jax.default_backend() != "cpu" if accelerator is None else accelerator
+    per_group = AGENTS_PER_ACCELERATOR if accelerator else AGENTS_PER_CORE
     most = min(memory_limit // agent_bytes, per_group * groups, max_shard or per_group * groups) // groups * groups
     if most == 0 and memory_limit >= agent_bytes:
         groups = most = 1

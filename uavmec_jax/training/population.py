@@ -23,12 +23,14 @@ class Progress:
         steps: environment steps made by all agents of the population together.
         total_steps: the same at the end of the training.
         mean_episode_length: mean length of the training episodes that ended in the chunk, slots.
+        detail: on a cluster, where the shards run.
     """
 
     shard: int
     steps: int
     total_steps: int
     mean_episode_length: float
+    detail: str = ""
 
 
 def take_padded(tree: Any, first: int, size: int) -> Any:

@@ -1,0 +1,40 @@
+"""How work is put on Ray. The command line reads its defaults from here, so nothing heavy is imported."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+LOCAL = "local"
+"""The address that starts Ray on this machine."""
+
+
+@dataclass(frozen=True)
+class RayOptions:
+    """Which cluster does the work, and what each shard needs.
+
+    Attributes:
+        address: of a cluster: ``host:port``, ``ray://host:port``, or ``auto`` for the one that this machine belongs to;
+            ``local`` starts one on this machine, with its cores; ``None`` joins the cluster that the environment variable
+            ``RAY_ADDRESS`` names, and starts one on this machine if it is not set.
+        cpus_per_shard: cores of a shard; by default those of this machine, and 1 if a shard has GPUs.
+        gpus_per_shard: GPUs of a shard.
+        resources: custom resources of Ray that a shard needs, by name.
+        retries: how often a shard is tried again after an error of the program. Nodes that die do not count.
+        time_limit_s: seconds after which an attempt at a shard is ended and made anew from the last checkpoint.
+    """
+
+    address: str | None = None
+    cpus_per_shard: int | None = None
+    gpus_per_shard: int = 0
+    resources: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    retries: int = 2
+    time_limit_s: float | None = None
+
+    @classmethod
+    def of(cls, ray: "RayOptions | str | bool | None") -> "RayOptions | None":
+        """Return the options that a caller means: ``True`` for the defaults, an address, options, or none."""
+        if isinstance(ray, str):
+            return cls(address=ray)
+        if isinstance(ray, cls):
+            return ray
+        return cls() if ray else None

@@ -1,0 +1,199 @@
+"""Carry out the shards of a run on Ray: each attempt at a shard is a task on some node."""
+
+import faulthandler
+import socket
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Any
+
+from uavmec_jax.cluster.connection import Cluster, cpus_per_shard, n_cores
+from uavmec_jax.cluster.tasks import Task, TaskError, TaskRun
+from uavmec_jax.errors import StudyError, UserError
+from uavmec_jax.files.locations import absolute, to_path
+from uavmec_jax.runs.attempt import Attempt
+from uavmec_jax.runs.folder import CHECKPOINT, LOG, RunFolder
+from uavmec_jax.runs.in_process import OnProgress, not_written, record_failure
+from uavmec_jax.runs.log import RunLog
+from uavmec_jax.runs.run_plan import Machine, Shard
+from uavmec_jax.runs.shard_runner import ShardRunner
+from uavmec_jax.runs.signals import StopSignal
+from uavmec_jax.training import host
+from uavmec_jax.training.population import Progress
+
+_LOOK_EVERY_S = 1.0
+"""Least seconds between two looks at the reports of all attempts."""
+
+_NODES_SHOWN = 4
+"""Nodes that the progress bar names."""
+
+_LOOK_SHARE = 0.05
+"""Largest share of the driver's time that these looks take."""
+
+
+def probe_node(cluster: Cluster) -> Machine:
+    """Return what a shard has on a node of the cluster, which may be waited for.
+
+    Raises:
+        StudyError: the package on the node is another version.
+    """
+    task = Task("probe", _describe_node, lambda: (cpus_per_shard(cluster.options), host.code_digest(), host.versions()))
+    ((_, machine),) = TaskRun(cluster).results([task])
+    if isinstance(machine, TaskError):
+        raise StudyError(f"a node of the Ray cluster: {machine.error}")
+    return Machine(**machine)
+
+
+def run_on_ray(
+    folder: RunFolder,
+    cluster: Cluster,
+    stop: StopSignal,
+    log: RunLog,
+    on_progress: OnProgress,
+    *,
+    other_code: bool = False,
+) -> None:
+    """Make attempts at every shard that is neither finished nor failed, until it is.
+
+    Raises:
+        Interrupted: a signal arrived; the shards in training have checkpoints.
+        StudyError: a file could not be written, the nodes have other code, or the connection to the cluster is lost.
+    """
+    open_shards = {s.number: s for s, state, _ in folder.states() if state not in ("done", "failed")}
+    watch = _Watch(folder, on_progress)
+
+    def task_of(shard: Shard) -> Task:
+        def arguments() -> tuple[Any, ...]:
+            attempt = folder.new_attempt(shard)
+            return absolute(folder.path), shard.number, attempt, _Worker.of(cluster, other_code)
+
+        def position() -> list[str]:
+            return sorted(file.name for file in folder.shard_folder(shard).glob(f"{CHECKPOINT}-*.npz"))
+
+        return Task(shard.number, attempt_shard, arguments, position)
+
+    def on_wait() -> None:
+        stop.check()
+        watch.look()
+
+    def on_event(event: str, *, task: int, error: str) -> None:
+        log.event(event, shard=task, error=error)
+
+    run = TaskRun(cluster, on_wait, on_event)
+    for number, outcome in run.results(map(task_of, open_shards.values())):
+        if isinstance(outcome, TaskError):
+            _give_up(folder, open_shards[number], outcome, log)
+    watch.look(last=True)
+
+
+def _give_up(folder: RunFolder, shard: Shard, failed: TaskError, log: RunLog) -> None:
+    """Record that a shard has failed, or end the run if that is not the shard's fault."""
+    if isinstance(failed.cause, UserError):
+        raise failed.cause
+    if isinstance(failed.cause, OSError | MemoryError):
+        raise not_written(folder, shard, getattr(failed.cause, "strerror", None) or str(failed.cause))
+    record_failure(folder, shard, failed.error, failed.trace, log)
+
+
+@dataclass
+class _Watch:
+    """Reports the progress of all attempts, from what they write."""
+
+    folder: RunFolder
+    on_progress: Callable[[Progress], None]
+    _next: float = field(default_factory=time.monotonic)
+
+    def look(self, *, last: bool = False) -> None:
+        started = time.monotonic()
+        if started < self._next and not last:
+            return
+        plan, steps, closed, retries = self.folder.plan, 0, 0, 0
+        nodes: Counter[str] = Counter()
+        for shard, state, report in self.folder.states():
+            retries += max(report.get("attempts", 0) - 1, 0)
+            if state in ("done", "failed"):
+                steps += plan.work_of(shard)
+                closed += 1
+            else:
+                steps += int(report.get("steps", 0))
+            if state == "running":
+                nodes[str(report.get("node"))] += 1
+        detail = ", ".join(f"{count} on {node}" for node, count in sorted(nodes.items())[:_NODES_SHOWN])
+        detail += f" and {len(nodes) - _NODES_SHOWN} more nodes" * (len(nodes) > _NODES_SHOWN)
+        detail += f"; {retries} repeated" * (retries > 0)
+        self.on_progress(Progress(max(closed - 1, 0), steps, plan.work, float("nan"), detail))
+        ended = time.monotonic()
+        self._next = ended + max(_LOOK_EVERY_S, (ended - started) / _LOOK_SHARE)
+
+
+@dataclass(frozen=True)
+class _Worker:
+    """What the process of an attempt is told."""
+
+    devices: int
+    other_code: bool
+    time_limit_s: float | None
+
+    @classmethod
+    def of(cls, cluster: Cluster, other_code: bool) -> "_Worker":
+        return cls(cpus_per_shard(cluster.options), other_code, cluster.options.time_limit_s)
+
+
+def attempt_shard(directory: str, number: int, attempt: str, worker: _Worker) -> None:
+    """Make an attempt at a shard; this runs on a node."""
+    host.use_all_cores(worker.devices)
+    folder, runner = _open(directory, worker.other_code)
+    shard = folder.plan.shards[number]
+    if folder.is_closed(shard):  # by an attempt that was believed dead
+        return
+    context = {"node": node_name(), "attempt": attempt}
+    log = RunLog(folder.path / LOG, tensorboard=folder.options.tensorboard, context=context)
+    try:
+        with StopSignal() as stop, _time_limit(worker.time_limit_s):
+            Attempt(folder, shard, attempt, runner, stop, log, node=node_name()).run()
+    finally:
+        log.close()
+
+
+@lru_cache(maxsize=1)
+def _open(directory: str, other_code: bool) -> tuple[RunFolder, ShardRunner]:
+    """Open the run; the programs that are compiled for its first shard serve the others in this process."""
+    folder = RunFolder.open(to_path(directory))
+    if not other_code:
+        folder.check_code()
+    return folder, ShardRunner(folder.study, folder.plan)
+
+
+def _describe_node(devices: int, code: str, versions: dict[str, str]) -> dict[str, Any]:
+    """Return the fields of :class:`Machine`; this runs on a node."""
+    host.use_all_cores(devices)
+    here = {"uavmec_jax's code": host.code_digest()} | host.versions()
+    there = {"uavmec_jax's code": code} | versions
+    if differ := [f"{name} {there[name][:12]} -> {here[name][:12]}" for name in here if here[name] != there[name]]:
+        raise StudyError(f"{node_name()} has other code than the driver ({', '.join(differ)}); install the same there")
+    machine = Machine.here()
+    share = 1.0 if machine.accelerator else min(devices / n_cores(), 1.0)  # other shards may be on the node too
+    return vars(replace(machine, free_bytes=int(share * machine.free_bytes)))
+
+
+def node_name() -> str:
+    """Return the name of this node: its host and the beginning of Ray's identity of it."""
+    import ray
+
+    return f"{socket.gethostname()}/{ray.get_runtime_context().get_node_id()[:8]}"
+
+
+@contextmanager
+def _time_limit(seconds: float | None) -> Iterator[None]:
+    """End this process if it is still inside after so many seconds, whatever it is doing."""
+    if seconds is None:
+        yield
+        return
+    faulthandler.dump_traceback_later(seconds, exit=True, file=2)
+    try:
+        yield
+    finally:
+        faulthandler.cancel_dump_traceback_later()
