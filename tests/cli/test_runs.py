@@ -8,18 +8,15 @@ import pytest
 from click.testing import CliRunner
 
 from tests.cli.test_advise import HARBOUR
-from tests.runs.processes import TINY
+from tests.runs.processes import TINY, plan_in
 from uavmec_jax.cli import main
-from uavmec_jax.runs.shared_run import prepare_run
 from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.study import parse_study
 
 
 @pytest.fixture(scope="module")
 def planned(tmp_path_factory):
-    directory = tmp_path_factory.mktemp("planned") / "run"
-    prepare_run(parse_study(TINY, "tiny"), directory, shard_size=2)
-    return directory
+    return plan_in(tmp_path_factory.mktemp("planned"), parse_study(TINY, "tiny"), shard_size=2)
 
 
 def test_status_of_a_run_that_has_not_been_started(planned):
@@ -57,8 +54,13 @@ def test_simulate():
     [
         (["resume", "."], "uavmec: .: holds no run that can be resumed (run_plan.json is missing)"),
         (["status", "nowhere"], "uavmec: nowhere: holds no run that can be resumed"),
-        (["worker", "."], "uavmec: .: holds no run that can be resumed"),
-        (["worker", ".", "--share", "3/2"], "uavmec: --share 3/2: give I/N, e.g. 1/2"),
+        (["run", "table5", "--ray", "table6"], "uavmec: --ray table6: is no address of a Ray cluster; give host:port,"),
+        (["resume", ".", "--retries", "3"], "uavmec: --cpus-per-shard, --gpus-per-shard, --resource, --retries and"),
+        (
+            ["run", "table5", "--resource", "fast=no", "--ray"],
+            "uavmec: --resource fast=no: the amount must be a positive",
+        ),
+        (["run", "table5", "--out", "gopher://x/run"], "uavmec: gopher://x/run: "),
         (
             ["run", "table5", "--simulate"],
             "uavmec: --simulate needs --speed, the training steps per second of one device",
@@ -109,11 +111,8 @@ def test_a_tour_and_a_run_refuse_each_others_folders(planned, tmp_path):
     ("module", "arguments", "line"),
     [
         ("optuna", ["search", "dqn", "--out", "s"], "search needs the package optuna, which is not installed"),
-        (
-            "submitit",
-            ["submit", "tiny.toml", "--jobs", "1"],
-            "submit needs the package submitit, which is not installed",
-        ),
+        ("ray", ["run", "tiny.toml", "--ray"], "--ray needs the package ray, which is not installed"),
+        ("upath", ["run", "tiny.toml", "--out", "s3://x/run"], "s3://x/run: needs a package that is not installed"),
         ("tensorboardX", ["run", "tiny.toml", "--tensorboard"], "--tensorboard needs the package tensorboardX"),
     ],
 )

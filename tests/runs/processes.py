@@ -6,6 +6,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+from uavmec_jax.runs.folder import RunFolder
+from uavmec_jax.runs.options import RunOptions
+from uavmec_jax.runs.run_plan import label_of, plan_run
+
 FINAL = ("agents.csv", "curves.npz", "evaluation.npz", "weights.npz", "study.toml")
 """Files that are the same to the bit, however often a run was stopped."""
 
@@ -25,6 +29,14 @@ validation_draws = 2
 planners = []
 baselines = ["oldest-first"]
 """
+
+
+def plan_in(directory, study, shard_size=None) -> Path:
+    """Plan a run in a folder, and run nothing."""
+    directory.mkdir(parents=True, exist_ok=True)
+    plan = plan_run(study, shard_size=shard_size)
+    RunFolder.create(directory, study, plan, RunOptions(), label_of(study, plan, "x"))
+    return directory
 
 
 class CtrlC(KeyboardInterrupt):
@@ -72,6 +84,6 @@ def bits(directory: Path) -> dict[str, bytes]:
 
 
 def events(directory: Path, kind: str) -> list[dict]:
-    """The events of one kind that the workers of a run have logged."""
+    """The events of one kind that the processes of a run have logged."""
     lines = [line for file in sorted((directory / "log").glob("*.jsonl")) for line in file.read_text().splitlines()]
     return [event for event in map(json.loads, lines) if event["event"] == kind]

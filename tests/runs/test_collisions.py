@@ -8,7 +8,6 @@ from tests.runs.processes import TINY
 from uavmec_jax.errors import StudyError
 from uavmec_jax.runs.results_folder import check_directory, load_results
 from uavmec_jax.runs.run import resume_run, run_study
-from uavmec_jax.runs.shared_run import prepare_run, work_on
 from uavmec_jax.runs.status import run_status
 from uavmec_jax.studies.study import parse_study
 
@@ -28,13 +27,11 @@ def tour(tmp_path):
     [
         (resume_run, "holds no run that can be resumed (run_plan.json is missing); it holds a tour of `uavmec plan`"),
         (run_status, "holds no run that can be resumed (run_plan.json is missing); it holds a tour of `uavmec plan`"),
-        (work_on, "holds no run that can be resumed (run_plan.json is missing); it holds a tour of `uavmec plan`"),
         (load_results, "holds no run; it holds a tour of `uavmec plan` (tour.json)"),
         (check_directory, "already holds a tour of `uavmec plan`; give another folder with --out"),
         (lambda folder: run_study(STUDY, folder), "already holds a tour of `uavmec plan`; give another folder"),
-        (lambda folder: prepare_run(STUDY, folder), "already holds a tour of `uavmec plan`; give another folder"),
     ],
-    ids=["resume", "status", "worker", "show", "plan", "run", "submit"],
+    ids=["resume", "status", "show", "plan", "run"],
 )
 def test_a_folder_with_a_tour_is_no_run(tour, use, line):
     files = sorted(tour.iterdir())
@@ -46,7 +43,7 @@ def test_a_folder_with_a_tour_is_no_run(tour, use, line):
 @pytest.mark.parametrize("name", ["run.json", "study.toml", "run_plan.json"])
 def test_a_folder_with_any_file_of_a_run_is_taken(tmp_path, name):
     (tmp_path / name).write_text("{}")
-    for use in (check_directory, lambda folder: run_study(STUDY, folder), lambda folder: prepare_run(STUDY, folder)):
+    for use in (check_directory, lambda folder: run_study(STUDY, folder)):
         with pytest.raises(
             StudyError, match="already holds a run; resume it with `uavmec resume`, or give another folder with --out"
         ):

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import socket
 
 import jax
 import numpy as np
@@ -13,11 +14,13 @@ from tests.runs.processes import FINAL, TINY, CtrlC, bits, events, stop_after
 from uavmec_jax.errors import StudyError
 from uavmec_jax.runs import folder as folders
 from uavmec_jax.runs import run as running
+from uavmec_jax.runs.attempt import Attempt
 from uavmec_jax.runs.folder import RunFolder
+from uavmec_jax.runs.log import RunLog
 from uavmec_jax.runs.options import RunOptions
 from uavmec_jax.runs.results_folder import load_results
 from uavmec_jax.runs.run import resume_run, run_study
-from uavmec_jax.runs.shared_run import prepare_run, work_on
+from uavmec_jax.runs.signals import StopSignal
 from uavmec_jax.runs.status import run_status
 from uavmec_jax.studies.study import parse_study
 
@@ -112,11 +115,12 @@ def test_a_checkpoint_of_another_shard_or_run_is_not_used(whole, stopped, tmp_pa
 @pytest.mark.parametrize("damage", [flip, lambda path: path.write_bytes(path.read_bytes()[:100])], ids=["bit", "end"])
 def test_a_damaged_result_is_reported_and_the_shard_runs_again(whole, stopped, tmp_path, damage):
     directory = copied(stopped, tmp_path)
-    damage(directory / "shards" / "00000" / "result.npz")
-    with pytest.raises(StudyError, match=r"00000/result.npz: (cannot be read|was altered|is not a finished)"):
+    (result,) = (directory / "shards" / "00000").glob("result-*.npz")
+    damage(result)
+    with pytest.raises(StudyError, match=r"00000/result-\S+.npz: (cannot be read|was altered|is not a finished)"):
         load_results(directory)
     resume_run(directory)
-    assert [(event["shard"], event["file"]) for event in events(directory, "damaged")] == [(0, "result.npz")]
+    assert [(event["shard"], event["file"]) for event in events(directory, "damaged")] == [(0, result.name)]
     assert bits(directory) == bits(whole)
 
 
@@ -131,24 +135,39 @@ def test_a_damaged_run_plan_is_refused(stopped, tmp_path, name, line):
     directory = copied(stopped, tmp_path)
     path = directory / name
     path.write_bytes(path.read_bytes().replace(b"4000" if name == "study.toml" else b'"agents": 4', b"4001", 1))
-    for use in (resume_run, run_status, work_on):
+    for use in (resume_run, run_status):
         with pytest.raises(StudyError, match=line):
             use(directory)
 
 
-def test_damaged_logs_and_leases_do_no_harm(whole, stopped, tmp_path):
+def test_damaged_logs_reports_and_owners_do_no_harm(whole, stopped, tmp_path):
     directory = copied(stopped, tmp_path)
-    for path in [*(directory / "log").iterdir(), *(directory / "shards").rglob("lease-*.json")]:
+    (directory / "shards" / "owner.json").write_text('{"machine": "')
+    for path in [*(directory / "log").iterdir(), *(directory / "shards").rglob("progress-*.json")]:
         path.write_bytes(path.read_bytes()[:20])
-    path = directory / "run_plan.json"
-    facts = json.loads(path.read_text())
-    facts["options"]["lease_s"] = 0.5
-    facts["sha256"] = folders._digest(facts)
-    path.write_text(json.dumps(facts))
-    for checkpoint in checkpoints(directory):
-        checkpoint.unlink()  # they belong to the original plan
+    assert run_status(directory).shards["stopped"] == 1
     resume_run(directory)
     assert bits(directory) == bits(whole)
+
+
+def test_two_attempts_at_the_same_time_do_no_harm(whole, stopped, tmp_path):
+    """A node that was believed dead wakes up: what it writes is what is there already, under another name."""
+    directory = copied(stopped, tmp_path)
+    folder = RunFolder.open(directory)
+    shard = folder.plan.shards[1]
+    attempts = [make_attempt(folder, shard) for _ in range(2)]
+    training = attempts[0]._checkpoints().resume(attempts[0]._start)
+    attempts[1].run()
+    attempts[0]._checkpoints().write(training)  # behind the other, which has finished
+    attempts[0].run()
+    assert len(folder.results(shard)) == 2
+    resume_run(directory)
+    assert bits(directory) == bits(whole)
+
+
+def make_attempt(folder, shard):
+    runner, log = running.ShardRunner(folder.study, folder.plan), RunLog(folder.path / "log")
+    return Attempt(folder, shard, folder.new_attempt(shard), runner, StopSignal(), log)
 
 
 @pytest.mark.parametrize("name", ["agents.csv", "evaluation.npz", "curves.npz", "run.json"])
@@ -164,9 +183,27 @@ def test_a_flipped_bit_in_the_results_is_found(whole, tmp_path, name):
 def test_another_schema_of_the_run_plan_is_refused(stopped, tmp_path):
     directory = copied(stopped, tmp_path)
     path = directory / "run_plan.json"
-    path.write_text(path.read_text().replace('"schema": 1', '"schema": 7', 1))
-    with pytest.raises(StudyError, match=r"run_plan.json: schema is 7; this version reads 1"):
+    path.write_text(path.read_text().replace('"schema": 2', '"schema": 7', 1))
+    with pytest.raises(StudyError, match=r"run_plan.json: schema is 7; this version reads 2"):
         resume_run(directory)
+
+
+def test_an_unfinished_run_with_leases_is_refused_and_a_finished_one_is_read(whole, stopped, tmp_path):
+    """Runs of versions whose workers held leases: their plans have the number of workers, and schema 1."""
+    for name, source in (("finished", whole), ("unfinished", stopped)):
+        directory = shutil.copytree(source, tmp_path / name)
+        path = directory / "run_plan.json"
+        facts = json.loads(path.read_text()) | {"schema": 1}
+        facts["plan"]["workers"] = 1
+        facts["sha256"] = folders._digest(facts)
+        path.write_text(json.dumps(facts))
+    assert resume_run(tmp_path / "finished").run["complete"]
+    assert run_status(tmp_path / "finished").shards["done"] == 2
+    for use in (resume_run, run_status):
+        with pytest.raises(
+            StudyError, match=r"unfinished: was started by a version whose workers held leases; finish it"
+        ):
+            use(tmp_path / "unfinished")
 
 
 def test_other_code_is_refused_unless_it_is_allowed(whole, stopped, tmp_path, monkeypatch):
@@ -192,16 +229,17 @@ def test_a_second_process_is_refused_with_the_name_of_the_first(tmp_path):
     run_study(STUDY, tmp_path / "run", on_progress=second)
     assert len(messages) == 2
     for line in messages:
-        assert re.search(r"run: process \d+ on \S+ is working in it; to help it, start `uavmec worker .*run`", line)
+        assert re.fullmatch(r"\S+run: process \d+ on \S+ is working in it", line)
 
 
-def test_workers_share_a_run_and_the_last_one_assembles_the_results(whole, tmp_path):
-    prepare_run(STUDY, tmp_path / "run", command="x", shard_size=2)
-    assert run_status(tmp_path / "run").shards["waiting"] == 2
-    assert work_on(tmp_path / "run")
-    assert bits(tmp_path / "run") == bits(whole)
-    assert run_status(tmp_path / "run").complete
-    assert work_on(tmp_path / "run")  # a late worker finds nothing to do
+def test_an_owner_on_another_machine_is_replaced_when_it_is_said_to_be_dead(whole, stopped, tmp_path):
+    directory = copied(stopped, tmp_path)
+    (directory / "shards" / "owner.json").write_text('{"machine": "elsewhere 0123", "pid": 7}')
+    assert run_status(directory).owner == "process 7 on elsewhere"
+    with pytest.raises(StudyError, match=r"process 7 on elsewhere is working in it; if .* dead, give --take-over"):
+        resume_run(directory)
+    resume_run(directory, take_over=True)
+    assert bits(directory) == bits(whole)
 
 
 def test_a_shard_that_fails_does_not_stop_the_others(whole, tmp_path, monkeypatch):
@@ -247,11 +285,21 @@ def test_a_run_can_have_any_path(whole, tmp_path, name):
 
 
 def test_the_log_says_what_happened(stopped):
-    assert [event["shard"] for event in events(stopped, "claimed")] == [0, 1, 1]
-    assert [event["taken_over"] for event in events(stopped, "claimed")] == [False, False, True]
+    started = events(stopped, "started")
+    assert [event["shard"] for event in started] == [0, 1, 1]
+    assert [event["attempt"].split("-")[0] for event in started] == ["01", "01", "02"]
     assert events(stopped, "chunk")[0].keys() == {
         "event", "at", "shard", "steps", "episode_length", "steps_per_second"
     }  # fmt: skip
+
+
+def test_the_status_tells_where_a_run_stands(stopped):
+    status = run_status(stopped)
+    assert status.shards == {"waiting": 0, "running": 0, "stopped": 1, "failed": 0, "done": 1}
+    assert (status.retries, status.owner, status.running) == (1, "", [])
+    assert 0.5 < status.steps / status.total_steps < 1
+    report = json.loads(sorted((stopped / "shards" / "00001").glob("progress-*.json"))[-1].read_text())
+    assert (report["state"], report["node"]) == ("stopped", socket.gethostname())
 
 
 def test_results_as_tables(whole):

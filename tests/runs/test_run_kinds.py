@@ -7,7 +7,6 @@ from tests.runs.test_log import read_scalars
 from uavmec_jax.errors import StudyError
 from uavmec_jax.runs.options import RunOptions
 from uavmec_jax.runs.run import resume_run, run_study
-from uavmec_jax.runs.shared_run import work_on
 from uavmec_jax.studies.study import parse_study
 
 pytestmark = pytest.mark.slow
@@ -20,11 +19,16 @@ def test_resuming_needs_the_reward_function_again(tmp_path):
         return terms["U"]
 
     run_study(STUDY, tmp_path / "run", reward=survival, command="x", shard_size=2, on_progress=stop_after(3))
-    for attempt in (resume_run, work_on):
-        with pytest.raises(
-            StudyError, match=r"was started with the reward function .*survival; give it to um.runs.resume_run"
-        ):
-            attempt(tmp_path / "run")
+    with pytest.raises(
+        StudyError, match=r"was started with the reward function .*survival; give it to um.runs.resume_run"
+    ):
+        resume_run(tmp_path / "run")
+    for use in (
+        lambda: run_study(STUDY, tmp_path / "other", reward=survival, ray=True),
+        lambda: resume_run(tmp_path / "run", reward=survival, ray=True),
+    ):
+        with pytest.raises(StudyError, match=r"a run on Ray (needs a directory and|takes) no reward function"):
+            use()
     again = resume_run(tmp_path / "run", reward=survival)
     assert again.run["complete"]
     assert again.run["reward_function"].endswith("survival")

@@ -2,13 +2,12 @@
 
 import pytest
 
-from tests.runs.processes import TINY
+from tests.runs.processes import TINY, plan_in
 from uavmec_jax.errors import StudyError
 from uavmec_jax.runs import shard_runner
 from uavmec_jax.runs.checkpoints import interval_s
 from uavmec_jax.runs.run import run_study
 from uavmec_jax.runs.run_plan import plan_run
-from uavmec_jax.runs.shared_run import prepare_run
 from uavmec_jax.runs.simulate import simulate
 from uavmec_jax.runs.status import run_status
 from uavmec_jax.studies import population
@@ -22,12 +21,12 @@ def test_a_hundred_thousand_agents_are_planned_without_making_one(tmp_path, monk
     for module in (population, shard_runner):
         monkeypatch.setattr(module, "make_agent_ids", refuse)
     study = parse_study(TINY, "tiny", {"axes.seeds": 50_000})
-    prepare_run(study, tmp_path / "run")
+    plan_in(tmp_path / "run", study)
     status = run_status(tmp_path / "run")
     assert status.agents == 100_000
     assert status.shards["waiting"] > 1000
     assert status.total_steps == 100_000 * 4000
-    assert [path.name for path in (tmp_path / "run" / "shards").iterdir()] == ["lease-0001.json"]
+    assert not (tmp_path / "run" / "shards").exists()
 
 
 def test_large_checkpoints_are_written_less_often():
@@ -38,7 +37,7 @@ def test_large_checkpoints_are_written_less_often():
 
 def test_a_population_beyond_all_memory_is_refused_with_an_estimate(tmp_path):
     study = parse_study(TINY, "tiny", {"axes.seeds": 500_000_000})
-    for use in (plan_run, lambda s: run_study(s, tmp_path / "run"), lambda s: prepare_run(s, tmp_path / "run")):
+    for use in (plan_run, lambda s: run_study(s, tmp_path / "run")):
         with pytest.raises(StudyError, match=r"1,000,000,000 agents need 93,132 GiB of memory, and as much disk"):
             use(study)
     assert not (tmp_path / "run").exists()
@@ -51,7 +50,7 @@ def test_a_simulation_adds_up():
     one, two = (simulate(study, plan, speed=100_000, devices=n * groups) for n in (1, 2))
     assert one.training_s == pytest.approx(200 * 1_000_000 / (100_000 * groups), rel=0.01)
     assert two.training_s == pytest.approx(one.training_s * 3 / 5, rel=0.01)  # five shards, two at a time
-    assert (one.workers, two.workers) == (1, 2)
+    assert (one.shards_at_once, two.shards_at_once) == (1, 2)
     fast = simulate(study, plan, speed={"dqn": 200_000}, devices=groups)
     assert fast.training_s == pytest.approx(one.training_s / 2)
     assert fast.other_s == one.other_s

@@ -42,9 +42,9 @@ class Simulation:
         other_s: wall time of compilation, evaluation and planning, seconds.
         disk_bytes: largest disk usage during the run.
         result_bytes: disk usage of the results.
-        memory_bytes: largest memory of one worker.
-        workers: number of workers at the same time.
-        devices: number of devices of all workers together.
+        memory_bytes: largest memory of one process.
+        shards_at_once: number of shards that train at the same time, each in its process.
+        devices: number of devices of all of them together.
     """
 
     training_s: float
@@ -52,7 +52,7 @@ class Simulation:
     disk_bytes: float
     result_bytes: float
     memory_bytes: float
-    workers: int
+    shards_at_once: int
     devices: int
 
     @property
@@ -69,9 +69,9 @@ class Simulation:
         wall = datetime.timedelta(seconds=round(self.wall_s))
         return (
             f"wall time {wall}: training {training}, compilation and evaluation {other}; "
-            f"{self.workers} worker{'s' * (self.workers > 1)} on {self.devices} device{'s' * (self.devices > 1)}\n"
+            f"{self.shards_at_once} shard{'s' * (self.shards_at_once > 1)} at a time on {self.devices} device{'s' * (self.devices > 1)}\n"
             f"disk at most {self.disk_bytes / 2**30:,.2f} GiB, of which results {self.result_bytes / 2**30:,.2f} GiB\n"
-            f"memory {self.memory_bytes / 2**30:,.2f} GiB per worker"
+            f"memory {self.memory_bytes / 2**30:,.2f} GiB per process"
         )
 
 
@@ -97,11 +97,11 @@ def simulate(
     options = options or RunOptions()
     training = other = checkpoints = shards = results = 0.0
     groups = max(partition.groups for partition in plan.partitions.values())
-    workers = max(min(devices // groups, len(plan.shards)), 1)
+    at_once = max(min(devices // groups, len(plan.shards)), 1)
     for part in split_study(study):
         name, evaluation = part.study.algorithm, part.study.evaluation
         partition, members, steps = plan.partitions[part.name], plan.members[part.name], plan.steps[part.name]
-        rounds = math.ceil(partition.shards / workers)
+        rounds = math.ceil(partition.shards / at_once)
         if steps:
             device_speed = speed[name] if isinstance(speed, Mapping) else speed
             shard_s = partition.shard_size * steps / (device_speed * min(partition.groups, devices))
@@ -111,8 +111,8 @@ def simulate(
             other += _COMPILE_S["training"]
         if evaluation.planners:
             draws = min(evaluation.planner_draws, evaluation.draws)
-            share_of_worker = min(rounds * partition.shard_size / members, 1.0)
-            planned = _distinct_scenarios(part.study) * draws * share_of_worker
+            share_of_process = min(rounds * partition.shard_size / members, 1.0)
+            planned = _distinct_scenarios(part.study) * draws * share_of_process
             other += _COMPILE_S["planners"] + _planning_s(part.study) * planned
         if evaluation.baselines or steps:
             other += _COMPILE_S["evaluation"]
@@ -123,10 +123,10 @@ def simulate(
     return Simulation(
         training_s=training,
         other_s=_START_S + _RAY_START_S * on_ray + other,
-        disk_bytes=shards + results + workers * checkpoints,
+        disk_bytes=shards + results + at_once * checkpoints,
         result_bytes=results,
         memory_bytes=_PROCESS_BYTES + max(1.0 * largest, _COPIES * shards),
-        workers=workers,
+        shards_at_once=at_once,
         devices=devices,
     )
 
