@@ -160,6 +160,8 @@ def test_two_attempts_at_the_same_time_do_no_harm(whole, stopped, tmp_path):
     attempts[1].run()
     attempts[0]._checkpoints().write(training)  # behind the other, which has finished
     attempts[0].run()
+    for attempt in attempts:
+        attempt.log.close()
     assert len(folder.results(shard)) == 2
     resume_run(directory)
     assert bits(directory) == bits(whole)

@@ -3,11 +3,15 @@
 import os
 import re
 import secrets
+import socket
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import psutil
 
 from uavmec_jax.cluster.options import LOCAL, RayOptions
 from uavmec_jax.errors import StudyError
@@ -15,10 +19,18 @@ from uavmec_jax.files.extras import optional
 
 _ADDRESS = re.compile(r"auto|local|(ray://)?[^/\s:]+:\d+|(ray://)?\[[0-9a-fA-F:]+\]:\d+")
 
+_ANSWER_S = 10.0
+"""Seconds in which a cluster must answer."""
+
 _QUIET = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # else Ray warns of a change to come
 }
+
+
+_ON_NETWORK = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+"""Ray's variable that keeps a cluster on the loopback interface if it is 0, in spite of its name on Linux too; else Ray
+listens on the machine's outer address, whatever address it is given."""
 
 
 @dataclass(frozen=True)
@@ -84,13 +96,11 @@ def connect(options: RayOptions) -> Iterator[Cluster]:
         raise StudyError(
             f"--ray {address}: is no address of a Ray cluster; give host:port, ray://host:port, auto or local"
         )
-    _check_token(address)
-    for name, value in _QUIET.items():
-        os.environ.setdefault(name, value)
-    ray = optional("ray", "--ray", "ray")
-    if ray.is_initialized():
-        yield Cluster(ray, options)
+    if (running := _running_ray()) is not None:
+        yield Cluster(running, options)
         return
+    _prepare_environment(address)
+    ray = optional("ray", "--ray", "ray")
     _init(ray, address)
     try:
         cluster = Cluster(ray, options)
@@ -109,15 +119,30 @@ def _init(ray: Any, address: str) -> None:
         StudyError: nobody answers at the address.
     """
     quiet = {"log_to_driver": False, "logging_level": "error"}
+    if ":" in address and not _answers(address):
+        raise StudyError(f"--ray {address}: no cluster answers there")
     try:
         if address == LOCAL:
-            # Loopback only: on the machine's outer address Ray would be open to the network.
-            here = {"num_cpus": n_cores(), "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
-            ray.init(LOCAL, **here, **quiet)
+            ray.init(LOCAL, num_cpus=n_cores(), include_dashboard=False, **quiet)
         else:
             ray.init(address, **quiet)
     except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
         raise StudyError(f"--ray {address}: no cluster answers there: {first_line(error)}") from None
+
+
+def _answers(address: str) -> bool:
+    """Return whether something listens at an address; Ray itself would try for minutes."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    hosts = [host.strip("[]")]
+    if hosts[0] in ("localhost", "127.0.0.1", "::1"):  # for Ray, that is any address of this machine
+        hosts += [one.address for addresses in psutil.net_if_addrs().values() for one in addresses]
+    for candidate in hosts:
+        try:
+            socket.create_connection((candidate, int(port)), timeout=_ANSWER_S).close()
+        except (OSError, OverflowError):
+            continue
+        return True
+    return False
 
 
 def first_line(error: BaseException) -> str:
@@ -126,17 +151,28 @@ def first_line(error: BaseException) -> str:
     return lines[0] if lines else type(error).__name__
 
 
-def _check_token(address: str) -> None:
-    """See to it that a local cluster is started with a token, and that a token is there where one is asked for.
+def _running_ray() -> Any:
+    """Return Ray if it runs in this process already, else ``None``."""
+    ray = sys.modules.get("ray")
+    return ray if ray is not None and ray.is_initialized() else None
 
-    Ray reads both variables when it is imported, and without a token waits for a minute before it gives up.
+
+def _prepare_environment(address: str) -> None:
+    """Set what Ray reads when it is imported: a token and the loopback interface for a cluster that is started here.
 
     Raises:
-        StudyError: ``RAY_AUTH_MODE`` is ``token`` and there is no token.
+        StudyError: ``RAY_AUTH_MODE`` is ``token`` and there is no token, for which Ray would wait in silence; or Ray has been
+            imported already, so that a cluster that it starts would be open to the network.
     """
-    if address == LOCAL and "RAY_AUTH_MODE" not in os.environ:
-        os.environ["RAY_AUTH_MODE"] = "token"
-        os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
+    for name, value in _QUIET.items():
+        os.environ.setdefault(name, value)
+    if address == LOCAL and os.environ.get(_ON_NETWORK) != "0":
+        if "ray" in sys.modules:
+            raise StudyError("--ray local: Ray was imported before; start it with ray.init() first, or give an address")
+        os.environ[_ON_NETWORK] = "0"
+        os.environ.setdefault("RAY_AUTH_MODE", "token")
+        if os.environ["RAY_AUTH_MODE"] == "token" and not _has_token():
+            os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
     if os.environ.get("RAY_AUTH_MODE") == "token" and not _has_token():
         raise StudyError(
             "RAY_AUTH_MODE is token and there is no token: set RAY_AUTH_TOKEN, or RAY_AUTH_TOKEN_PATH to a file with it, "

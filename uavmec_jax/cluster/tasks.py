@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from uavmec_jax.cluster.connection import Cluster, first_line
-from uavmec_jax.errors import StudyError
+from uavmec_jax.errors import StudyError, UserError
 
 _IN_FLIGHT = 1000
 """Tasks that are submitted at the same time: enough for any cluster to see what is waiting."""
@@ -118,7 +118,7 @@ class TaskRun:
         except exceptions.RayTaskError as error:
             cause = error.cause if isinstance(error.cause, BaseException) else error
             tries.errors += 1
-            if tries.errors > self.cluster.options.retries:
+            if tries.errors > self.cluster.options.retries or isinstance(cause, UserError):
                 return True, TaskError(f"{type(cause).__name__}: {cause}", str(error), cause)
             self.on_event("retried", task=task.key, error=f"{type(cause).__name__}: {cause}")
         except exceptions.NodeDiedError as error:

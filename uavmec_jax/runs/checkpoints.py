@@ -82,12 +82,12 @@ class Checkpoints:
         else:
             progress = {"chunks_done": training.chunks_done, "steps": training.steps, "seconds": training.seconds}
             write_checked(path, SCHEMA, self.identity | progress, training.arrays(), compressed=False)
-        for older in self._generations()[_KEPT:]:
+        size = path.stat().st_size
+        for older in self._generations()[_KEPT:]:  # perhaps this one, if another attempt is further
             older.unlink(missing_ok=True)
         self._last = time.monotonic()
         self._cost_s = self._last - started
         training.seconds["checkpoint"] = training.seconds.get("checkpoint", 0.0) + self._cost_s
-        size = path.stat().st_size
         self.log_event("checkpoint", file=path.name, steps=training.steps, bytes=size, seconds=self._cost_s)
 
     def resume(self, start: Callable[[], Training]) -> Training:

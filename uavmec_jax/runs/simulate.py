@@ -69,7 +69,8 @@ class Simulation:
         wall = datetime.timedelta(seconds=round(self.wall_s))
         return (
             f"wall time {wall}: training {training}, compilation and evaluation {other}; "
-            f"{self.shards_at_once} shard{'s' * (self.shards_at_once > 1)} at a time on {self.devices} device{'s' * (self.devices > 1)}\n"
+            f"{self.shards_at_once} shard{'s' * (self.shards_at_once > 1)} at a time on {self.devices} "
+            f"device{'s' * (self.devices > 1)}\n"
             f"disk at most {self.disk_bytes / 2**30:,.2f} GiB, of which results {self.result_bytes / 2**30:,.2f} GiB\n"
             f"memory {self.memory_bytes / 2**30:,.2f} GiB per process"
         )
