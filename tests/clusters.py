@@ -6,6 +6,9 @@ from contextlib import contextmanager
 from uavmec_jax.cluster.connection import _prepare_environment
 from uavmec_jax.cluster.options import LOCAL
 
+FORK = "ignore:os.fork"
+"""Filter for JAX's warning: Ray starts simulated nodes by forking, here, where JAX has been imported."""
+
 CPUS = 2
 """Cores that each node claims to have, whatever the machine has: as many as the tests' devices."""
 

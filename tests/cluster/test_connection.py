@@ -17,7 +17,8 @@ from uavmec_jax.cluster.connection import connect
 from uavmec_jax.cluster.options import RayOptions
 with connect(RayOptions()) as cluster:
     print(cluster.slots(), os.environ["RAY_AUTH_MODE"], len(cluster.nodes()))
-    processes = [psutil.Process(), *psutil.Process().children(recursive=True)]
+    here = psutil.Process()
+    processes = [here, *here.children(recursive=True)]
     for process in processes:
         for connection in process.net_connections(kind="inet"):
             if connection.status == psutil.CONN_LISTEN:

@@ -6,13 +6,13 @@ import time
 
 import pytest
 
-from tests.clusters import add_node, simulated_cluster
+from tests.clusters import FORK, add_node, simulated_cluster
 from uavmec_jax.cluster.connection import connect
 from uavmec_jax.cluster.options import RayOptions
 from uavmec_jax.cluster.tasks import Task, TaskError, TaskRun
 from uavmec_jax.errors import StudyError
 
-pytestmark = pytest.mark.ray
+pytestmark = [pytest.mark.ray, pytest.mark.filterwarnings(FORK)]
 
 ONE = RayOptions(address="auto", cpus_per_shard=1, retries=2)
 

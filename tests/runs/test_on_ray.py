@@ -8,7 +8,7 @@ import time
 import psutil
 import pytest
 
-from tests.clusters import CPUS, add_node, simulated_cluster
+from tests.clusters import CPUS, FORK, add_node, simulated_cluster
 from tests.runs.processes import TINY, bits, events, start, uavmec
 from uavmec_jax.cluster.options import RayOptions
 from uavmec_jax.cluster.tasks import TaskError
@@ -21,7 +21,7 @@ from uavmec_jax.runs.run import resume_run, run_study
 from uavmec_jax.runs.status import run_status
 from uavmec_jax.studies.study import parse_study
 
-pytestmark = pytest.mark.ray
+pytestmark = [pytest.mark.ray, pytest.mark.filterwarnings(FORK)]
 
 ALL = parse_study(
     TINY,

@@ -6,13 +6,14 @@ import secrets
 import socket
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import psutil
 
+from uavmec_jax.cluster.local import local_cluster
 from uavmec_jax.cluster.options import LOCAL, RayOptions
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files.extras import optional
@@ -101,31 +102,28 @@ def connect(options: RayOptions) -> Iterator[Cluster]:
         return
     _prepare_environment(address)
     ray = optional("ray", "--ray", "ray")
-    _init(ray, address)
-    try:
-        cluster = Cluster(ray, options)
-        if address == LOCAL and not cluster.slots():
-            needed = ", ".join(f"{name} {amount}" for name, amount in cluster.requirements.items() if amount)
-            raise StudyError(f"--ray local: this machine cannot take a shard, which needs {needed}; ask for less")
-        yield cluster
-    finally:
-        ray.shutdown()
+    with local_cluster(n_cores()) if address == LOCAL else nullcontext(address) as joined:
+        _init(ray, joined)
+        try:
+            cluster = Cluster(ray, options)
+            if address == LOCAL and not cluster.slots():
+                needed = ", ".join(f"{name} {amount}" for name, amount in cluster.requirements.items() if amount)
+                raise StudyError(f"--ray local: this machine cannot take a shard, which needs {needed}; ask for less")
+            yield cluster
+        finally:
+            ray.shutdown()
 
 
 def _init(ray: Any, address: str) -> None:
-    """Initialise Ray in this process.
+    """Connect this process to a cluster.
 
     Raises:
         StudyError: nobody answers at the address.
     """
-    quiet = {"log_to_driver": False, "logging_level": "error"}
     if ":" in address and not _answers(address):
         raise StudyError(f"--ray {address}: no cluster answers there")
     try:
-        if address == LOCAL:
-            ray.init(LOCAL, num_cpus=n_cores(), include_dashboard=False, **quiet)
-        else:
-            ray.init(address, **quiet)
+        ray.init(address, log_to_driver=False, logging_level="error")
     except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
         raise StudyError(f"--ray {address}: no cluster answers there: {first_line(error)}") from None
 
