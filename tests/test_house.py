@@ -19,14 +19,14 @@ OURS = [one for one in IMPORTS if one.imported.split(".")[0] == PACKAGE]
 
 ORDER = (
     *("cli", "interop", "reporting", "search", "runs", "studies", "scenarios", "training", "agents", "planning"),
-    *("traffic", "env", "files", "errors"),
+    *("traffic", "env", "cluster", "files", "errors"),
 )
 """The rooms from top to bottom."""
 
 INSIDE_FUNCTIONS = {
     "interop.gymnasium_env": ("uavmec_jax.reporting.map_figure",),  # matplotlib, for those who render
     "interop.five_values": ("gymnax.environments",),  # the caller's library
-    "runs.cluster": ("uavmec_jax.runs.shared_run",),  # on the node: cores are chosen before JAX is used
+    "cluster.worker": ("ray",),  # of the extra `ray`
     "search.search": ("sqlalchemy", "sqlalchemy.exc"),  # of the extra `search`
     "traffic.worker": ("libsumo",),  # of the extra `traffic`
 }

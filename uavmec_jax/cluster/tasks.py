@@ -3,7 +3,7 @@
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -71,10 +71,10 @@ class TaskRun:
     on_wait: Callable[[], None] = lambda: None
     on_event: Callable[..., None] = lambda event, **facts: None
 
-    def results(self, tasks: Iterable[Task]) -> Iterator[tuple[Any, Any]]:
+    def results(self, tasks: Iterable[Task]) -> Generator[tuple[Any, Any], None, None]:
         """Yield ``(key, result)`` of every task as it finishes; the result is a :class:`TaskError` if it failed for good.
 
-        If the caller stops early or an exception passes through, tasks that run are cancelled and have time to save
+        If the generator is closed early or an exception passes through, tasks that run are cancelled and have time to save
         their work.
 
         Raises:
