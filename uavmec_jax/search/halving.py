@@ -28,10 +28,11 @@ from uavmec_jax.studies.population import (
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.studies.statistics import mean_interval
 from uavmec_jax.training import host
+from uavmec_jax.training.chunks import Validation
 from uavmec_jax.training.partition import Partition, PopulationTooLargeError, partition_population
 from uavmec_jax.training.population import take_padded
 from uavmec_jax.training.regroup import regroup
-from uavmec_jax.training.training import Trainer, Training, Validation
+from uavmec_jax.training.training import Trainer, Training
 
 Values = Mapping[str, Any]
 """The settings of a trial: name -> value."""

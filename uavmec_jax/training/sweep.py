@@ -20,10 +20,10 @@ from uavmec_jax.env.scenario import Scenario
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files.validation import suggest
 from uavmec_jax.training import host
+from uavmec_jax.training.chunks import Validation
 from uavmec_jax.training.partition import PopulationTooLargeError, partition_population
 from uavmec_jax.training.population import Progress, train_population
 from uavmec_jax.training.trained_shard import TrainedShard
-from uavmec_jax.training.training import Validation
 
 
 @dataclass(frozen=True)
