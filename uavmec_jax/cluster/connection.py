@@ -3,6 +3,7 @@
 import os
 import re
 import secrets
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -124,14 +125,21 @@ def _init(ray: Any, address: str) -> None:
     """
     quiet = {"log_to_driver": False, "logging_level": "error"}
     try:
-        if address == LOCAL:
-            # Loopback only: on the machine's outer address Ray would be open to the network.
-            here = {"num_cpus": n_cores(), "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
-            ray.init(LOCAL, **here, **quiet)
-        else:
-            ray.init(address, **quiet)
+        with warnings.catch_warnings():
+            # JAX warns of every fork once its threads run; Ray's processes are other programs from the first moment on.
+            warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
+            _start_or_join(ray, address, quiet)
     except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
         raise StudyError(f"--ray {address}: no cluster answers there: {first_line(error)}") from None
+
+
+def _start_or_join(ray: Any, address: str, quiet: dict[str, Any]) -> None:
+    if address != LOCAL:
+        ray.init(address, **quiet)
+        return
+    # Loopback only: on the machine's outer address Ray would be open to the network.
+    here = {"num_cpus": n_cores(), "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
+    ray.init(LOCAL, **here, **quiet)
 
 
 def first_line(error: BaseException) -> str:

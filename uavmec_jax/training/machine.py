@@ -10,6 +10,7 @@ from uavmec_jax.cluster.tasks import Task, TaskError, TaskRun
 from uavmec_jax.cluster.worker import node_name
 from uavmec_jax.errors import StudyError
 from uavmec_jax.training import host
+from uavmec_jax.training.partition import Partition, partition_population
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,16 @@ class Machine:
     def here(cls) -> "Machine":
         """Return this machine."""
         return cls(jax.local_device_count(), jax.default_backend() != "cpu", host.free_memory())
+
+    def partition(self, n_agents: int, agent_bytes: int) -> Partition:
+        """Partition a population for it, see :func:`partition_population`.
+
+        Raises:
+            PopulationTooLargeError: one agent does not fit.
+        """
+        return partition_population(
+            n_agents, agent_bytes, self.free_bytes, groups=self.devices, accelerator=self.accelerator
+        )
 
 
 def probe_node(cluster: Cluster) -> Machine:
