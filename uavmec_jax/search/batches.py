@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -19,6 +19,7 @@ from uavmec_jax.training.trained_shard import TrainedShard
 from uavmec_jax.training.training import Trainer, Training
 
 
+@runtime_checkable
 class Batch(Protocol):
     """The population of a batch, trained from rung to rung. Agents are counted without padding, in the order of ``keep``."""
 
