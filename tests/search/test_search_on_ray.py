@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import jax
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
@@ -46,7 +48,20 @@ def test_a_search_with_its_runs_has_the_same_files_on_ray(space, tmp_path):  # n
         assert load_results(tmp_path / "there" / name).run["complete"]
 
 
-def test_a_worker_is_killed_in_each_stretch_of_a_batch(space, cluster):  # noqa: F811
+@pytest.fixture
+def evaluated(monkeypatch):
+    """The weights that are evaluated, batch by batch: short trainings differ in them, and hardly in their lifetimes."""
+    weights, objective = [], SuccessiveHalving._objective
+
+    def record(self, agents, trained, algorithm):
+        weights.append(trained)
+        return objective(self, agents, trained, algorithm)
+
+    monkeypatch.setattr(SuccessiveHalving, "_objective", record)
+    return weights
+
+
+def test_a_worker_is_killed_in_each_stretch_of_a_batch(space, cluster, evaluated):  # noqa: F811
     reference = SuccessiveHalving(space).run(TRIALS)
     assert [outcome.value is None for outcome in reference].count(True) == 2
     shares = []
@@ -57,6 +72,7 @@ def test_a_worker_is_killed_in_each_stretch_of_a_batch(space, cluster):  # noqa:
         assert halving.run(TRIALS) == reference
     assert first
     assert second
+    jax.tree.map(np.testing.assert_array_equal, *evaluated)
     assert [trials for _, trials in shares] == [4, 4, 2]
     assert shares[-1][0] == 1
 
