@@ -27,9 +27,10 @@ from uavmec_jax.files.archives import open_checked, write_checked
 from uavmec_jax.studies.population import make_agents, make_algorithm, validation_keys
 from uavmec_jax.studies.study import load_study
 from uavmec_jax.training import host
+from uavmec_jax.training.chunks import Validation
 from uavmec_jax.training.partition import partition_population
 from uavmec_jax.training.population import take_padded
-from uavmec_jax.training.training import Trainer, Training, Validation
+from uavmec_jax.training.training import Trainer, Training
 
 SCHEMA = 1
 

@@ -22,7 +22,7 @@ NO_ROOM = ("", "__main__", "_version")
 
 ORDER = (
     *("cli", "interop", "reporting", "search", "runs", "studies", "scenarios", "training", "learning", "agents"),
-    *("planning", "traffic", "env", "world", "files", "errors"),
+    *("planning", "traffic", "env", "world", "cluster", "files", "errors"),
 )
 """The rooms from top to bottom, with those of older checkouts; others stand above them."""
 

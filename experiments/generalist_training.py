@@ -42,7 +42,8 @@ from uavmec_jax.studies.population import evaluation_keys, make_agents, make_alg
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.studies.study import load_study
 from uavmec_jax.training import host
-from uavmec_jax.training.training import Trainer, Training, Validation
+from uavmec_jax.training.chunks import Validation
+from uavmec_jax.training.training import Trainer, Training
 
 _OPTIMIZER = clipped_adam(eps=1e-5)
 _BATCH_SIZE = 1024

@@ -71,9 +71,9 @@ def ours(seeds: int, steps: int) -> list[float]:
     from uavmec_jax.env.rollout import rollouts
     from uavmec_jax.env.scenario import make_scenario
     from uavmec_jax.training import host
+    from uavmec_jax.training.chunks import Validation
     from uavmec_jax.training.partition import partition_population
     from uavmec_jax.training.population import train_population
-    from uavmec_jax.training.training import Validation
 
     host.use_all_cores()
     algorithm, hyper = dqn.algorithm(dqn.DQNSpec(total_steps=steps)), dqn.DQNHyper()

@@ -23,9 +23,10 @@ from sb3_quality import DRAWS, bound_of, measure_sb3
 from uavmec_jax.studies.population import evaluation_keys, make_agent_ids, make_agents, make_algorithm
 from uavmec_jax.studies.study import load_study
 from uavmec_jax.training import host
+from uavmec_jax.training.chunks import Validation
 from uavmec_jax.training.partition import partition_population
 from uavmec_jax.training.population import take_padded
-from uavmec_jax.training.training import Trainer, Validation
+from uavmec_jax.training.training import Trainer
 
 SHARES = (0.90, 0.95, 0.97, 0.98)
 """Shares of the bound above which a learner is to stay."""

@@ -27,7 +27,7 @@ INSIDE_FUNCTIONS = {
     "interop.gymnasium_env": ("uavmec_jax.reporting.map_figure",),  # matplotlib, for those who render
     "interop.five_values": ("gymnax.environments",),  # the caller's library
     "cluster.local": ("ray",),  # of the extra `ray`
-    "runs.on_ray": ("ray",),  # of the extra `ray`; this runs on a node
+    "cluster.worker": ("ray",),  # of the extra `ray`
     "search.search": ("sqlalchemy", "sqlalchemy.exc"),  # of the extra `search`
     "traffic.worker": ("libsumo",),  # of the extra `traffic`
 }

@@ -18,10 +18,10 @@ from uavmec_jax.env.rewards import make_reward
 from uavmec_jax.env.rollout import rollouts
 from uavmec_jax.env.scenario import make_scenario
 from uavmec_jax.planning.heuristics import HEURISTICS
+from uavmec_jax.training.chunks import Validation
 from uavmec_jax.training.partition import Partition, PopulationTooLargeError, partition_population
 from uavmec_jax.training.population import train_population
 from uavmec_jax.training.programs import Best, _validate
-from uavmec_jax.training.training import Validation
 
 GIB = 2**30
 

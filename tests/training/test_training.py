@@ -11,10 +11,11 @@ from numpy.testing import assert_array_equal
 
 from tests.populations import differs, make_agent, stack, take
 from uavmec_jax.agents import a2c
+from uavmec_jax.training.chunks import Validation
 from uavmec_jax.training.partition import Partition
 from uavmec_jax.training.population import train_population
 from uavmec_jax.training.regroup import regroup
-from uavmec_jax.training.training import Trainer, Validation
+from uavmec_jax.training.training import Trainer
 
 ALGORITHM = a2c.algorithm(a2c.A2CSpec(total_steps=200, hidden=(4,)))
 VALIDATION = Validation(every=100, draws=2, chunks=2)

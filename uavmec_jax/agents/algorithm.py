@@ -1,7 +1,7 @@
 """The interface of the learning algorithms: a pair of pure functions over one agent, and a policy from its weights."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
 from flax import struct
@@ -73,6 +73,7 @@ class Algorithm:
         observation_fn: ``(params, layout, state) -> observation [..., obs_size]``; by default the paper's.
         value_fn: ``(hyper, weights, observation [B, obs_size]) -> value [B]``, the expected return from a state;
             ``None`` if the algorithm learns no state values.
+        spec: the static settings; another process binds the algorithm from its name and these.
     """
 
     name: str
@@ -84,6 +85,7 @@ class Algorithm:
     greedy: Callable[[Any, Weights, Array], Array]
     observation_fn: Callable[[Params, Layout, State], Array] = observe
     value_fn: Callable[[Any, Weights, Array], Array] | None = None
+    spec: Any = field(default=None, compare=False)
 
     def policy(self, hyper: Any, weights: Weights) -> Policy:
         """Return the greedy policy of an agent. Ties go to the lowest device number; states may be batched."""

@@ -69,7 +69,8 @@ class RegisteredAlgorithm:
         Raises:
             ValueError: settings contradict each other.
         """
-        return self.bind(self.spec_of(settings, total_steps=total_steps, n_devices=n_devices, max_age=max_age))
+        spec = self.spec_of(settings, total_steps=total_steps, n_devices=n_devices, max_age=max_age)
+        return dataclasses.replace(self.bind(spec), spec=spec)
 
 
 ALGORITHMS: Mapping[str, RegisteredAlgorithm] = MappingProxyType(

@@ -125,8 +125,9 @@ def print_simulation(
         InputError: no speed is given.
     """
     from uavmec_jax.cluster.connection import devices_per_shard
-    from uavmec_jax.runs.run_plan import Machine, plan_run
+    from uavmec_jax.runs.run_plan import plan_run
     from uavmec_jax.runs.simulate import simulate
+    from uavmec_jax.training.machine import Machine
 
     if speed is None:
         raise InputError(

@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from uavmec_jax.cli.common import Interrupt, command_line, new_folder, print_json, print_tables
-from uavmec_jax.cli.options import json_option, out_option
+from uavmec_jax.cli.options import json_option, out_option, ray_options
 
 _SIGINT = 2
 
@@ -19,8 +19,9 @@ _SIGINT = 2
 )
 @out_option(help="Folder of the search (default: runs/<space>-<time>).")
 @click.option("--no-confirm", is_flag=True, help="Skip the comparison on the study's own scenarios.")
+@ray_options
 @json_option
-def search(space: str, trials: int | None, out: Path | None, no_confirm: bool, as_json: bool) -> None:
+def search(space: str, trials: int | None, out: Path | None, no_confirm: bool, ray: Any, as_json: bool) -> None:
     """Search hyperparameters in SPACE: a search space that ships with the package (dqn), or a TOML file.
 
     To continue a search that was stopped, give its folder as --out.
@@ -30,6 +31,7 @@ def search(space: str, trials: int | None, out: Path | None, no_confirm: bool, a
     host.use_all_cores()
     from rich.console import Console
 
+    from uavmec_jax.cluster.connection import connected
     from uavmec_jax.reporting import canvas
     from uavmec_jax.reporting.compare import comparison
     from uavmec_jax.reporting.search import history_figure, importance_figure, search_json, search_tables
@@ -41,9 +43,14 @@ def search(space: str, trials: int | None, out: Path | None, no_confirm: bool, a
     directory, console = out or new_folder(loaded.name), Console(stderr=as_json)
     console.print(f"[bold]{loaded.name}[/bold]: {loaded.trials} trials of {loaded.study}, {loaded.batch} at a time")
     try:
-        with console.status("compiling") as line:
+        # one connection for the search and its two runs
+        with console.status("compiling") as line, connected(ray):
             result = run_search(
-                loaded, directory, command=command_line(), on_progress=lambda progress: line.update(_describe(progress))
+                loaded,
+                directory,
+                command=command_line(),
+                ray=ray,
+                on_progress=lambda progress: line.update(_describe(progress)),
             )
             for name, figure in (("history", history_figure(result)), ("importance", importance_figure(result))):
                 canvas.save(figure, directory / f"{name}.png")
@@ -54,6 +61,7 @@ def search(space: str, trials: int | None, out: Path | None, no_confirm: bool, a
                     result,
                     directory,
                     command=command_line(),
+                    ray=ray,
                     on_progress=lambda name, progress: line.update(
                         f"{name} settings: {progress.steps / progress.total_steps:.0%}"
                     ),

@@ -114,6 +114,20 @@ def connect(options: RayOptions) -> Iterator[Cluster]:
             ray.shutdown()
 
 
+@contextmanager
+def connected(options: RayOptions | None) -> Iterator[Cluster | None]:
+    """Connect to a cluster as :func:`connect` does, if one is wanted.
+
+    Raises:
+        StudyError: see :func:`connect`.
+    """
+    if options is None:
+        yield None
+        return
+    with connect(options) as cluster:
+        yield cluster
+
+
 def _init(ray: Any, address: str) -> None:
     """Connect this process to a cluster.
 

@@ -3,8 +3,8 @@
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Iterable
+from dataclasses import dataclass, field
 from typing import Any
 
 from uavmec_jax.cluster.connection import Cluster, first_line
@@ -70,11 +70,12 @@ class TaskRun:
     cluster: Cluster
     on_wait: Callable[[], None] = lambda: None
     on_event: Callable[..., None] = lambda event, **facts: None
+    _remote: dict[Callable[..., Any], Any] = field(default_factory=dict)
 
-    def results(self, tasks: Iterable[Task]) -> Iterator[tuple[Any, Any]]:
+    def results(self, tasks: Iterable[Task]) -> Generator[tuple[Any, Any], None, None]:
         """Yield ``(key, result)`` of every task as it finishes; the result is a :class:`TaskError` if it failed for good.
 
-        If the caller stops early or an exception passes through, tasks that run are cancelled and have time to save
+        If the generator is closed early or an exception passes through, tasks that run are cancelled and have time to save
         their work.
 
         Raises:
@@ -100,7 +101,9 @@ class TaskRun:
             self._cancel(list(running))
 
     def _submit(self, task: Task) -> Any:
-        remote = self.cluster.ray.remote(task.function)
+        remote = self._remote.get(task.function)
+        if remote is None:  # made once: each remote function is sent to the cluster anew
+            remote = self._remote[task.function] = self.cluster.ray.remote(task.function)
         options = {"max_retries": 0, "name": str(task.key), **self.cluster.requirements}
         return remote.options(**options).remote(*task.arguments())
 

@@ -1,24 +1,23 @@
 """Carry out the shards of a run on Ray: each attempt at a shard is a task on some node."""
 
-import faulthandler
-import socket
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
 
-from uavmec_jax.cluster.connection import Cluster, cpus_per_shard, n_cores
+from uavmec_jax.cluster.connection import Cluster, cpus_per_shard
 from uavmec_jax.cluster.tasks import Task, TaskError, TaskRun
-from uavmec_jax.errors import StudyError, UserError
+from uavmec_jax.cluster.worker import node_name, time_limit
+from uavmec_jax.errors import UserError
 from uavmec_jax.files.locations import absolute, to_path
 from uavmec_jax.runs.attempt import Attempt
 from uavmec_jax.runs.folder import CHECKPOINT, LOG, RunFolder
 from uavmec_jax.runs.in_process import OnProgress, not_written, record_failure
 from uavmec_jax.runs.log import RunLog
-from uavmec_jax.runs.run_plan import Machine, Shard
+from uavmec_jax.runs.run_plan import Shard
 from uavmec_jax.runs.shard_runner import ShardRunner
 from uavmec_jax.runs.signals import StopSignal
 from uavmec_jax.training import host
@@ -32,19 +31,6 @@ _NODES_SHOWN = 4
 
 _LOOK_SHARE = 0.05
 """Largest share of the driver's time that these looks take."""
-
-
-def probe_node(cluster: Cluster) -> Machine:
-    """Return what a shard has on a node of the cluster, which may be waited for.
-
-    Raises:
-        StudyError: the package on the node is another version.
-    """
-    task = Task("probe", _describe_node, lambda: (cpus_per_shard(cluster.options), host.code_digest(), host.versions()))
-    ((_, machine),) = TaskRun(cluster).results([task])
-    if isinstance(machine, TaskError):
-        raise StudyError(f"a node of the Ray cluster: {machine.error}")
-    return Machine(**machine)
 
 
 def run_on_ray(
@@ -83,9 +69,11 @@ def run_on_ray(
         log.event(event, shard=task, error=error)
 
     run = TaskRun(cluster, on_wait, on_event)
-    for number, outcome in run.results(map(task_of, open_shards.values())):
-        if isinstance(outcome, TaskError):
-            _give_up(folder, open_shards[number], outcome, log)
+    # closing: an error here must cancel the other attempts now, not when its traceback is let go
+    with closing(run.results(map(task_of, open_shards.values()))) as outcomes:
+        for number, outcome in outcomes:
+            if isinstance(outcome, TaskError):
+                _give_up(folder, open_shards[number], outcome, log)
     watch.look(last=True)
 
 
@@ -152,7 +140,7 @@ def attempt_shard(directory: str, number: int, attempt: str, worker: _Worker) ->
     context = {"node": node_name(), "attempt": attempt}
     log = RunLog(folder.path / LOG, tensorboard=folder.options.tensorboard, context=context)
     try:
-        with StopSignal() as stop, _time_limit(worker.time_limit_s):
+        with StopSignal() as stop, time_limit(worker.time_limit_s):
             Attempt(folder, shard, attempt, runner, stop, log, node=node_name()).run()
     finally:
         log.close()
@@ -165,35 +153,3 @@ def _open(directory: str, other_code: bool) -> tuple[RunFolder, ShardRunner]:
     if not other_code:
         folder.check_code()
     return folder, ShardRunner(folder.study, folder.plan)
-
-
-def _describe_node(devices: int, code: str, versions: dict[str, str]) -> dict[str, Any]:
-    """Return the fields of :class:`Machine`; this runs on a node."""
-    host.use_all_cores(devices)
-    here = {"uavmec_jax's code": host.code_digest()} | host.versions()
-    there = {"uavmec_jax's code": code} | versions
-    if differ := [f"{name} {there[name][:12]} -> {here[name][:12]}" for name in here if here[name] != there[name]]:
-        raise StudyError(f"{node_name()} has other code than the driver ({', '.join(differ)}); install the same there")
-    machine = Machine.here()
-    share = 1.0 if machine.accelerator else min(devices / n_cores(), 1.0)  # other shards may be on the node too
-    return vars(replace(machine, free_bytes=int(share * machine.free_bytes)))
-
-
-def node_name() -> str:
-    """Return the name of this node: its host and the beginning of Ray's identity of it."""
-    import ray
-
-    return f"{socket.gethostname()}/{ray.get_runtime_context().get_node_id()[:8]}"
-
-
-@contextmanager
-def _time_limit(seconds: float | None) -> Iterator[None]:
-    """End this process if it is still inside after so many seconds, whatever it is doing."""
-    if seconds is None:
-        yield
-        return
-    faulthandler.dump_traceback_later(seconds, exit=True, file=2)
-    try:
-        yield
-    finally:
-        faulthandler.cancel_dump_traceback_later()

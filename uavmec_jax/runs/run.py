@@ -1,13 +1,12 @@
 """Run a study, in this process or on Ray, or resume a run, and assemble its results."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from uavmec_jax.cluster.connection import Cluster, connect
+from uavmec_jax.cluster.connection import Cluster, connected
 from uavmec_jax.cluster.options import RayOptions
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files.locations import remove_folder, to_path
@@ -15,7 +14,7 @@ from uavmec_jax.files.locks import lock_folder
 from uavmec_jax.runs.folder import LOG, RUN_PLAN, SHARDS, RunFolder
 from uavmec_jax.runs.in_process import OnProgress, run_here
 from uavmec_jax.runs.log import OnEvent, RunLog, tensorboard_writer
-from uavmec_jax.runs.on_ray import probe_node, run_on_ray
+from uavmec_jax.runs.on_ray import run_on_ray
 from uavmec_jax.runs.options import RunOptions
 from uavmec_jax.runs.results_folder import (
     assemble_results,
@@ -31,6 +30,7 @@ from uavmec_jax.runs.signals import StopSignal
 from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.studies.shard_result import ShardResult
+from uavmec_jax.training.machine import probe_node
 from uavmec_jax.training.population import Progress
 
 RewardFunction = Callable[[Mapping[str, Any]], Any]
@@ -84,7 +84,7 @@ def run_study(
     options = options or RunOptions()
     if options.tensorboard:
         tensorboard_writer()
-    with _connected(ray) as cluster:
+    with connected(ray) as cluster:
         machine = probe_node(cluster) if cluster else None
         plan = plan_run(study, shard_size=shard_size, machine=machine)
         on_plan(plan)
@@ -137,7 +137,7 @@ def resume_run(
         raise StudyError(f"{path}: a run on Ray takes no reward function")
     if not other_code:
         folder.check_code()
-    with lock_folder(folder.shards_folder, path, take_over=take_over), _connected(ray) as cluster:
+    with lock_folder(folder.shards_folder, path, take_over=take_over), connected(ray) as cluster:
         for shard in folder.plan.shards:
             folder.failure(shard).unlink(missing_ok=True)
         label = {"other_code": differ} if (differ := folder.other_code()) else {}
@@ -145,22 +145,17 @@ def resume_run(
 
 
 def run_or_resume(
-    study: Study, directory: str | Path, *, command: str | None = None, on_progress: OnProgress = lambda _: None
+    study: Study,
+    directory: str | Path,
+    *,
+    command: str | None = None,
+    ray: RayOptions | str | bool | None = None,
+    on_progress: OnProgress = lambda _: None,
 ) -> Results:
     """Run a study in a folder; if it holds a run, resume that, or load its results if it is complete."""
     if (to_path(directory) / RUN_PLAN).exists():
-        return resume_run(directory, on_progress=on_progress)
-    return run_study(study, directory, command=command, on_progress=on_progress)
-
-
-@contextmanager
-def _connected(ray: RayOptions | None) -> Iterator[Cluster | None]:
-    """Connect to a cluster, if one is wanted."""
-    if ray is None:
-        yield None
-        return
-    with connect(ray) as cluster:
-        yield cluster
+        return resume_run(directory, ray=ray, on_progress=on_progress)
+    return run_study(study, directory, command=command, ray=ray, on_progress=on_progress)
 
 
 def _run(

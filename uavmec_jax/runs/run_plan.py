@@ -6,8 +6,6 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
 
-import jax
-
 from uavmec_jax.errors import StudyError
 from uavmec_jax.studies.parts import split_study
 from uavmec_jax.studies.places import describe_places, load_evacuations
@@ -15,6 +13,7 @@ from uavmec_jax.studies.population import make_algorithm, n_agents, seeds_of
 from uavmec_jax.studies.results import SCHEMA
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.training import host
+from uavmec_jax.training.machine import Machine
 from uavmec_jax.training.partition import Partition, PopulationTooLargeError, partition_population
 
 _UNTRAINED_SHARD = 100
@@ -95,26 +94,6 @@ class RunPlan:
         devices = f"{groups} device{'s' * (groups > 1)}"
         steps = self.total_steps // self.agents
         return f"{self.agents:,} agents x {steps:,} steps in {count} shard{'s' * (count > 1)}{of_size} on {devices}, {memory}"
-
-
-@dataclass(frozen=True)
-class Machine:
-    """What a shard has for its training, on this machine or on a node of a cluster.
-
-    Attributes:
-        devices: JAX devices.
-        accelerator: whether they are accelerators rather than cores.
-        free_bytes: memory of all of them together, see :func:`host.free_memory`.
-    """
-
-    devices: int
-    accelerator: bool
-    free_bytes: int
-
-    @classmethod
-    def here(cls) -> "Machine":
-        """Return this machine."""
-        return cls(jax.local_device_count(), jax.default_backend() != "cpu", host.free_memory())
 
 
 def plan_run(study: Study, *, shard_size: int | None = None, machine: Machine | None = None) -> RunPlan:

@@ -28,8 +28,9 @@ from uavmec_jax.studies.population import (
 )
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.studies.shard_result import ShardResult
+from uavmec_jax.training.chunks import Validation
 from uavmec_jax.training.partition import Partition
-from uavmec_jax.training.training import Trainer, Training, Validation
+from uavmec_jax.training.training import Trainer, Training
 
 _SCENARIO_AXES = ("seed", "powered", "connected", "scenarios", "place", *TRACED_PARAMS)
 """Axes that change an agent's scenario; all others concern its training, as does the seed of drawn scenarios."""

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
+from uavmec_jax.cluster.options import RayOptions
 from uavmec_jax.runs.run import run_or_resume
 from uavmec_jax.search.search import SearchResult, best_study
 from uavmec_jax.studies.compare import Side
@@ -18,6 +19,7 @@ def confirm(
     directory: str | Path,
     *,
     command: str | None = None,
+    ray: RayOptions | str | bool | None = None,
     on_progress: Callable[[str, Progress], None] = lambda name, progress: None,
 ) -> tuple[Side, Side]:
     """Train the study with its own and with the best settings on its own scenarios, or load runs that exist.
@@ -26,6 +28,7 @@ def confirm(
         result: the result of the search.
         directory: folder of the search; the runs are in its folders ``baseline`` and ``best``.
         command: the command line, for the labels of the runs.
+        ray: put the shards of the runs on Ray, as for :func:`uavmec_jax.runs.run.run_study`.
         on_progress: called with the name of the run, ``baseline`` or ``best``, and its progress.
 
     Returns:
@@ -33,6 +36,7 @@ def confirm(
 
     Raises:
         KeyboardInterrupt: a signal arrived; the runs can be resumed.
+        StudyError: a run is not possible, see :func:`uavmec_jax.runs.run.run_study`.
     """
     space = result.space
     baseline = load_study(space.study, space.change | {"axes.seeds": space.confirm_seeds})
@@ -44,7 +48,7 @@ def confirm(
         def report(progress: Progress, name: str = name) -> None:
             on_progress(name, progress)
 
-        results = run_or_resume(study, Path(directory) / name, command=command, on_progress=report)
+        results = run_or_resume(study, Path(directory) / name, command=command, ray=ray, on_progress=report)
         if not results.run["complete"]:
             raise KeyboardInterrupt
         sides.append(Side(results))

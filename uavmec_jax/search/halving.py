@@ -12,9 +12,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from uavmec_jax.agents.algorithm import Agent, Algorithm
-from uavmec_jax.agents.registry import ALGORITHMS
+from uavmec_jax.agents.networks import Weights
+from uavmec_jax.cluster.connection import Cluster
 from uavmec_jax.env.rewards import make_reward
 from uavmec_jax.errors import StudyError
+from uavmec_jax.search.batches import Batch, BatchInProcess, BatchOnRay
 from uavmec_jax.search.space import REWARD, Space, reward_with
 from uavmec_jax.studies.evaluation import evaluate_learned
 from uavmec_jax.studies.population import (
@@ -28,10 +30,12 @@ from uavmec_jax.studies.population import (
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.studies.statistics import mean_interval
 from uavmec_jax.training import host
-from uavmec_jax.training.partition import Partition, PopulationTooLargeError, partition_population
+from uavmec_jax.training.chunks import Chunk, Validation, chunks_of
+from uavmec_jax.training.machine import Machine
+from uavmec_jax.training.on_ray import ShardProgram
+from uavmec_jax.training.partition import Partition, PopulationTooLargeError
 from uavmec_jax.training.population import take_padded
-from uavmec_jax.training.regroup import regroup
-from uavmec_jax.training.training import Trainer, Training, Validation
+from uavmec_jax.training.training import Trainer
 
 Values = Mapping[str, Any]
 """The settings of a trial: name -> value."""
@@ -56,10 +60,14 @@ class SuccessiveHalving:
 
     Attributes:
         space: the search space.
+        cluster: where the batches train; ``None`` for this process.
+        machine: what a shard has there; by default this machine.
         on_progress: called with ``(finished share of the batch, trials in training)``.
     """
 
     space: Space
+    cluster: Cluster | None = None
+    machine: Machine | None = None
     on_progress: Callable[[float, int], None] = lambda share, trials: None
     _trainers: dict[Any, Trainer] = field(default_factory=dict)
 
@@ -89,28 +97,31 @@ class SuccessiveHalving:
         """Train and evaluate a batch of trials that share their static settings.
 
         Raises:
-            StudyError: the batch does not fit in memory.
+            StudyError: the batch does not fit in memory, or a shard failed on the cluster.
         """
         agents, keys, algorithm = self._population(trials)
-        trainer = self._trainer(trials[0], algorithm, agents, keys, len(trials) * self.n_scenarios)
-        size = trainer.partition.shard_size
-        trainings = [
-            trainer.start(*take_padded((agents, keys), shard * size, size)) for shard in range(trainer.partition.shards)
-        ]
+        chunks = chunks_of(algorithm, self._validation)
+        batch = self._start(algorithm, agents, keys, chunks)
         remaining = list(range(len(trials)))
         rungs: list[dict[int, float]] = [{} for _ in trials]
-        for chunk in self._rungs(trainer):
-            self._train_until(trainings, chunk, len(remaining))
-            scores = self._trial_means(np.concatenate([self._scores(one) for one in trainings]), len(remaining))
+        for rung in self._rungs(chunks):
+
+            def on_share(share: float, n_trials: int = len(remaining)) -> None:
+                self.on_progress(share, n_trials)
+
+            batch.train_until(rung, on_share)
+            scores = self._trial_means(batch.scores(self.space.weights), len(remaining))
+            steps = chunks[rung - 1].last * algorithm.steps_per_iteration
             for trial, score in zip(remaining, scores, strict=True):
-                rungs[trial][trainings[0].steps] = float(score)
-            if chunk < len(trainer.chunks):
+                rungs[trial][steps] = float(score)
+            if rung < len(chunks):
                 n = max(1, round(self.space.halving.keep * len(remaining)))
                 best = np.sort(np.argsort(-scores, kind="stable")[:n])
                 remaining = [remaining[k] for k in best]
-                trainings = regroup(trainings, self._members(best))
+                batch.keep(self._members(best))
         agents = jax.tree.map(lambda leaf: leaf[self._members(remaining)], agents)
-        values = dict(zip(remaining, self._objective(agents, trainings, algorithm), strict=True))
+        weights = batch.weights(self.space.weights)
+        values = dict(zip(remaining, self._objective(agents, weights, algorithm), strict=True))
         return [TrialOutcome(values.get(k), rungs[k]) for k in range(len(trials))]
 
     def _population(self, trials: Sequence[Values]) -> tuple[Agent, Key[Array, "A D"], Algorithm]:
@@ -143,24 +154,32 @@ class SuccessiveHalving:
         static = {key: tuple(v) if isinstance(v, list) else v for key, v in trial.items() if hasattr(settings, key)}
         return self.study.model_copy(update={name: settings.model_copy(update=static)})
 
-    def _trainer(self, trial: Values, algorithm: Algorithm, agents: Agent, keys: Key[Array, "A D"], n: int) -> Trainer:
-        """Return the trainer for a batch of ``n`` agents, compiled with the first batch of its shape."""
-        study = self._with_static(trial)
-        settings, static = getattr(study, study.algorithms[0]), ALGORITHMS[algorithm.name].static
-        shape = tuple((key, str(getattr(settings, key))) for key in sorted(trial) if key in static)
-        partition = self._partition(algorithm, n)
-        trainer = self._trainers.get((shape, partition.shard_size))
+    @property
+    def _validation(self) -> Validation:
+        settings = self.study.evaluation
+        return Validation(every=settings.validate_every, draws=settings.validation_draws)
+
+    def _start(self, algorithm: Algorithm, agents: Agent, keys: Key[Array, "A D"], chunks: list[Chunk]) -> Batch:
+        """Start the training of a batch, on the cluster if there is one."""
+        partition = self._partition(algorithm, keys.shape[0])
+        if self.cluster is not None:
+            program = ShardProgram.of(algorithm, self._validation, partition)
+            return BatchOnRay(self.cluster, program, chunks, agents, keys)
+        return BatchInProcess(self._trainer(algorithm, agents, keys, partition), agents, keys)
+
+    def _trainer(self, algorithm: Algorithm, agents: Agent, keys: Key[Array, "A D"], partition: Partition) -> Trainer:
+        """Return the trainer for a batch, compiled with the first batch of its shape."""
+        shape = (algorithm.spec, partition.shard_size)
+        trainer = self._trainers.get(shape)
         if trainer is None:
-            validation = Validation(every=study.evaluation.validate_every, draws=study.evaluation.validation_draws)
             members, draws = take_padded((agents, keys), 0, partition.shard_size)
-            trainer = Trainer.compile(algorithm, members, draws, validation, partition)
-            self._trainers[(shape, partition.shard_size)] = trainer
+            trainer = self._trainers[shape] = Trainer.compile(algorithm, members, draws, self._validation, partition)
         return replace(trainer, partition=partition)
 
     def _partition(self, algorithm: Algorithm, n: int) -> Partition:
-        """Cut a batch into equal shards, which all fit in memory twice: regrouping copies them."""
+        """Cut a batch into equal shards, which all fit in this machine's memory twice: regrouping copies them."""
         try:
-            partition = partition_population(n, algorithm.agent_bytes, host.free_memory())
+            partition = (self.machine or Machine.here()).partition(n, algorithm.agent_bytes)
         except PopulationTooLargeError as error:
             raise StudyError(f"{self.space.name}: {error}") from None
         needed, free = 2 * partition.shards * partition.shard_bytes, host.free_memory()
@@ -171,37 +190,23 @@ class SuccessiveHalving:
             )
         return partition
 
-    def _rungs(self, trainer: Trainer) -> list[int]:
+    def _rungs(self, chunks: list[Chunk]) -> list[int]:
         """Return the numbers of chunks after which trials are compared: the first validation after each rung, and the end."""
-        validations = [k + 1 for k, chunk in enumerate(trainer.chunks) if chunk.validates]
-        rungs = [share * len(trainer.chunks) for share in sorted(self.space.halving.rungs)]
-        return sorted({min(v for v in validations if v >= rung) for rung in rungs} | {len(trainer.chunks)})
-
-    def _train_until(self, trainings: list[Training], chunk: int, trials: int) -> None:
-        total = len(trainings) * len(trainings[0].trainer.chunks)
-        for training in trainings:
-            for _ in training.run(until=chunk):
-                self.on_progress(sum(shard.chunks_done for shard in trainings) / total, trials)
+        validations = [k + 1 for k, chunk in enumerate(chunks) if chunk.validates]
+        rungs = [share * len(chunks) for share in sorted(self.space.halving.rungs)]
+        return sorted({min(v for v in validations if v >= rung) for rung in rungs} | {len(chunks)})
 
     def _trial_means(self, values: Float[np.ndarray, " padded"], trials: int) -> Float[np.ndarray, " trials"]:
         """Return each trial's mean over its scenarios, from one value per agent."""
         return values[: trials * self.n_scenarios].reshape(trials, self.n_scenarios).mean(axis=1)
 
-    def _scores(self, training: Training) -> Float[np.ndarray, " padded"]:
-        """Return the validation scores by which trials are compared: the best so far, or the last ones."""
-        return training.best_scores if self.space.weights == "best" else training.scores[-1]
-
     def _members(self, trials: Sequence[int] | np.ndarray) -> Int[np.ndarray, " members"]:
         """Return the indices of the agents of some trials in the population."""
         return (np.asarray(trials)[:, None] * self.n_scenarios + np.arange(self.n_scenarios)).ravel()
 
-    def _objective(self, agents: Agent, trainings: list[Training], algorithm: Algorithm) -> list[float]:
+    def _objective(self, agents: Agent, weights: Weights, algorithm: Algorithm) -> list[float]:
         """Evaluate the objective of fully trained trials, on draws that no validation has used."""
-        n, size = agents.key.shape[0], trainings[0].trainer.partition.shard_size
-        keys = evaluation_keys(self.study, self.agent_ids * (n // self.n_scenarios))
-        sizes = [min(size, n - k * size) for k in range(len(trainings))]
-        pieces = [training.weights(size)[self.space.weights] for training, size in zip(trainings, sizes, strict=True)]
-        weights = jax.tree.map(lambda *leaves: np.concatenate(leaves), *pieces)
+        keys = evaluation_keys(self.study, self.agent_ids * (agents.key.shape[0] // self.n_scenarios))
         lifetimes = evaluate_learned(algorithm, agents, keys, {"searched": weights})["searched"].mean_lifetime
         per_trial = lifetimes.reshape(-1, self.n_scenarios)
         if self.space.objective == "mean":

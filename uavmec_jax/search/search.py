@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
+from uavmec_jax.cluster.connection import connected
+from uavmec_jax.cluster.options import RayOptions
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files.extras import optional
 from uavmec_jax.files.writing import write_text
@@ -28,6 +30,7 @@ from uavmec_jax.search.space import (
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.studies.study import load_study, study_toml
 from uavmec_jax.training import host
+from uavmec_jax.training.machine import probe_node
 
 if TYPE_CHECKING:
     import optuna
@@ -89,19 +92,24 @@ def run_search(
     directory: str | Path,
     *,
     command: str = "",
+    ray: RayOptions | str | bool | None = None,
     on_progress: Callable[[SearchProgress], None] = lambda _: None,
 ) -> SearchResult:
     """Run a search, or continue one that was stopped: an unfinished batch is repeated with the same trials.
+
+    On Ray, each shard of a batch is a task from one rung to the next. A shard whose node dies begins again at the last rung.
 
     Args:
         space: from :func:`uavmec_jax.search.space.load_space`.
         directory: folder of the search: its database, table and best settings.
         command: the command line, for the label.
-        on_progress: called while batches train.
+        ray: train the batches on Ray: ``True`` for the cluster of ``RAY_ADDRESS``, else one on this machine; an address;
+            or options. All nodes must have the same version of this package.
+        on_progress: called while batches train; on Ray, whenever a shard gets to a rung.
 
     Raises:
         StudyError: Optuna is not installed, the directory holds another search or something else, or a batch does not
-            fit in memory.
+            fit in memory; on Ray, also if it is not installed or cannot be reached, a node has other code, or a shard failed.
     """
     optuna = _import_optuna()
     path = Path(directory)
@@ -109,7 +117,23 @@ def run_search(
     path.mkdir(parents=True, exist_ok=True)
     write_text(path / FACTS, json.dumps({"space": space.model_dump(mode="json"), "command": command} | host.describe()))
     trials = _open_trials(optuna, path, space)
-    halving = SuccessiveHalving(space)
+    with connected(RayOptions.of(ray)) as cluster:
+        halving = SuccessiveHalving(space, cluster, probe_node(cluster) if cluster else None)
+        _run_batches(optuna, trials, halving, on_progress)
+    result = _search_result(optuna, trials, space)
+    write_text(path / TRIALS, result.trials.to_csv(index=False, float_format="%.6g"))
+    write_text(path / BEST, study_toml(best_study(result)))
+    return result
+
+
+def _run_batches(
+    optuna: Any,
+    trials: "optuna.Study",
+    halving: SuccessiveHalving,
+    on_progress: Callable[[SearchProgress], None],
+) -> None:
+    """Run the batches of a search that are not finished, and store their outcomes."""
+    space = halving.space
     for batch in range(math.ceil(space.trials / space.batch)):
         members = _propose_batch(optuna, trials, space, batch)
         if all(trial.state.is_finished() for trial in members):
@@ -123,10 +147,6 @@ def run_search(
         for trial, outcome in zip(members, outcomes, strict=True):
             if not trial.state.is_finished():
                 _record(optuna, trials, trial, outcome)
-    result = _search_result(optuna, trials, space)
-    write_text(path / TRIALS, result.trials.to_csv(index=False, float_format="%.6g"))
-    write_text(path / BEST, study_toml(best_study(result)))
-    return result
 
 
 def best_study(result: SearchResult) -> Study:

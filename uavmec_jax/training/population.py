@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Array, Key
 
 from uavmec_jax.agents.algorithm import Agent, Algorithm
+from uavmec_jax.training.chunks import Validation
 from uavmec_jax.training.partition import Partition
 from uavmec_jax.training.trained_shard import TrainedShard
-from uavmec_jax.training.training import Trainer, Validation
+from uavmec_jax.training.training import Trainer
 
 
 @dataclass(frozen=True)

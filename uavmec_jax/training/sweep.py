@@ -13,17 +13,20 @@ from jaxtyping import PRNGKeyArray
 
 from uavmec_jax.agents.algorithm import Agent, Algorithm
 from uavmec_jax.agents.registry import ALGORITHMS, RegisteredAlgorithm, check_end
+from uavmec_jax.cluster.connection import connected
+from uavmec_jax.cluster.options import RayOptions
 from uavmec_jax.env.layout import check_one_uav
 from uavmec_jax.env.params import leaf_dtype
 from uavmec_jax.env.rollout import Policy
 from uavmec_jax.env.scenario import Scenario
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files.validation import suggest
-from uavmec_jax.training import host
-from uavmec_jax.training.partition import PopulationTooLargeError, partition_population
+from uavmec_jax.training.chunks import Validation
+from uavmec_jax.training.machine import Machine, probe_node
+from uavmec_jax.training.on_ray import PopulationOnRay, ShardProgram
+from uavmec_jax.training.partition import Partition, PopulationTooLargeError
 from uavmec_jax.training.population import Progress, train_population
 from uavmec_jax.training.trained_shard import TrainedShard
-from uavmec_jax.training.training import Validation
 
 
 @dataclass(frozen=True)
@@ -81,6 +84,7 @@ def train(
     hyper: Mapping[str, Any] | None = None,
     settings: Mapping[str, Any] | None = None,
     validation: Validation | None = None,
+    ray: RayOptions | str | bool | None = None,
     on_progress: Callable[[Progress], None] = lambda _: None,
 ) -> TrainedPopulation:
     """Train one agent on each of ``A`` scenarios, all of them as one program.
@@ -94,11 +98,15 @@ def train(
         hyper: traced hyperparameters, each one number or an array ``[A]``.
         settings: static settings: ``hidden``, ``batch_size``, ...
         validation: when and how to validate the greedy policies; the best score selects the best weights.
-        on_progress: called after every chunk.
+        ray: train the shards of the population on Ray: ``True`` for the cluster of ``RAY_ADDRESS``, else one on this
+            machine; an address; or options. All nodes must have the same version of this package. A shard whose node dies
+            begins again on another.
+        on_progress: called after every chunk; on Ray, after every shard.
 
     Raises:
         StudyError: an unknown algorithm, hyperparameter or setting, a wrong number of values, too little memory, several
-            UAVs or depots, or a DQN on the paper's observation where episodes go on after a failure.
+            UAVs or depots, or a DQN on the paper's observation where episodes go on after a failure; on Ray, also if it
+            is not installed or cannot be reached, a node has other code, or a shard failed.
         AssertionError: the scenarios are not a batch.
     """
     if algorithm not in ALGORITHMS:
@@ -112,13 +120,36 @@ def train(
     batched_hyper = _batch_hyper(algorithm, registered, hyper or {}, n)
     training_key, validation_key = jax.random.split(key)
     agents = Agent(key=jax.random.split(training_key, n), scenario=scenarios, hyper=batched_hyper)
-    try:
-        partition = partition_population(n, bound.agent_bytes, host.free_memory())
-    except PopulationTooLargeError as error:
-        raise StudyError(f"steps is {steps}: {error}") from None
     draws = jax.random.split(validation_key, (n, validation.draws))
-    shards = train_population(bound, agents, draws, validation=validation, partition=partition, on_progress=on_progress)
-    return TrainedPopulation(bound, batched_hyper, _concatenate(list(shards)))
+    with connected(RayOptions.of(ray)) as cluster:
+        machine = probe_node(cluster) if cluster else Machine.here()
+        try:
+            partition = machine.partition(n, bound.agent_bytes)
+        except PopulationTooLargeError as error:
+            raise StudyError(f"steps is {steps}: {error}") from None
+        if cluster:
+            population = PopulationOnRay.of(cluster, ShardProgram.of(bound, validation, partition), agents, draws)
+            results = population.train(on_shard=_shard_reporter(n, bound, partition, on_progress))
+        else:
+            results = list(
+                train_population(
+                    bound, agents, draws, validation=validation, partition=partition, on_progress=on_progress
+                )
+            )
+    return TrainedPopulation(bound, batched_hyper, _concatenate(results))
+
+
+def _shard_reporter(
+    n: int, algorithm: Algorithm, partition: Partition, on_progress: Callable[[Progress], None]
+) -> Callable[[int], None]:
+    """Return a function that reports the progress of ``n`` agents when so many shards are finished."""
+
+    def report(finished: int) -> None:
+        agents = min(finished * partition.shard_size, n)
+        steps = algorithm.total_steps
+        on_progress(Progress(finished - 1, agents * steps, n * steps, float("nan")))
+
+    return report
 
 
 def _check_scenarios(algorithm: str, scenarios: Scenario, observation: str) -> None:

@@ -5,7 +5,6 @@ program trains on one device. If there are fewer devices than groups, the groups
 are therefore the same, to the bit, on any number of devices.
 """
 
-import itertools
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -19,33 +18,10 @@ from jaxtyping import Array, Float, Int, Key
 
 from uavmec_jax.agents.algorithm import Agent, Algorithm, AlgorithmState
 from uavmec_jax.agents.networks import Weights
+from uavmec_jax.training.chunks import Chunk, Validation, chunks_of
 from uavmec_jax.training.partition import Partition
 from uavmec_jax.training.programs import Best, Programs, initial_best, make_mesh, put_on_mesh
 from uavmec_jax.training.trained_shard import TrainedShard
-
-
-@dataclass(frozen=True)
-class Validation:
-    """When and how the greedy policies are validated during training.
-
-    Attributes:
-        every: environment steps of one agent between validations, rounded down to whole iterations.
-        draws: number of episodes per validation, each with its own draw of the task volumes.
-        chunks: number of jitted chunks between validations, for the progress display and the training curve.
-    """
-
-    every: int = 10_000
-    draws: int = 8
-    chunks: int = 4
-
-
-@dataclass(frozen=True)
-class Chunk:
-    """Iterations ``first <= i < last`` of a training, and whether a validation follows."""
-
-    first: int
-    last: int
-    validates: bool
 
 
 @dataclass(frozen=True)
@@ -101,13 +77,7 @@ class Trainer:
     @cached_property
     def chunks(self) -> list[Chunk]:
         """The chunks of a whole training; the last one ends with a validation."""
-        every = max(self.validation.every // self.algorithm.steps_per_iteration, 1)
-        chunks = []
-        for start in range(0, self.algorithm.iterations, every):
-            stop = min(start + every, self.algorithm.iterations)
-            edges = np.linspace(start, stop, min(self.validation.chunks, stop - start) + 1).astype(int)
-            chunks += [Chunk(int(first), int(last), int(last) == stop) for first, last in itertools.pairwise(edges)]
-        return chunks
+        return chunks_of(self.algorithm, self.validation)
 
 
 @dataclass
