@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from uavmec_jax.errors import StudyError
+from uavmec_jax.files.locations import files_in_subfolders, reached
 from uavmec_jax.files.locks import is_known_dead
 from uavmec_jax.files.reading import read_json_or_empty, read_text
 from uavmec_jax.files.writing import write_text
@@ -74,14 +75,20 @@ class RunFolder:
 
         Raises:
             StudyError: the folder holds no run; the run plan or the study was altered or is damaged; or another version
-                wrote it.
+                wrote it; or its object store cannot be reached.
         """
+        with reached(path):
+            return cls(path, cls._read(path))
+
+    @staticmethod
+    def _read(path: Path) -> dict[str, Any]:
+        """Read and check a run plan."""
         file = path / RUN_PLAN
         if not file.is_file():
             tour = f"; it holds a tour of `uavmec plan` ({TOUR})" if (path / TOUR).is_file() else ""
             raise StudyError(f"{path}: holds no run that can be resumed ({RUN_PLAN} is missing){tour}")
         try:
-            facts = json.loads(read_text(file, StudyError))
+            facts: dict[str, Any] = json.loads(read_text(file, StudyError))
             schema, digest = facts["schema"], facts["sha256"]
         except (ValueError, KeyError, TypeError) as error:
             raise StudyError(f"{file}: cannot be read: {error!r}; plan the study anew in another folder") from None
@@ -93,7 +100,7 @@ class RunFolder:
             raise StudyError(f"{file}: was altered or damaged: it does not fit its SHA-256; plan the study anew")
         if _sha256(read_text(path / STUDY, StudyError)) != facts["study_sha256"]:
             raise StudyError(f"{path / STUDY}: was altered or damaged since the run was planned; run it as a new study")
-        return cls(path, facts)
+        return facts
 
     @cached_property
     def study(self) -> Study:
@@ -185,7 +192,7 @@ class RunFolder:
         """Yield every shard with its state and what its latest attempt last reported: progress, or why it failed."""
         complete = self.complete
         files: dict[str, list[Path]] = {}
-        for file in () if complete else self.shards_folder.glob("*/*"):
+        for file in () if complete else files_in_subfolders(self.shards_folder):
             files.setdefault(file.parent.name, []).append(file)
         for shard in self.plan.shards:
             present = sorted(files.get(f"{shard.number:05d}", ()), key=lambda file: file.name)

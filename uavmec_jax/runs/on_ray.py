@@ -94,7 +94,7 @@ def _give_up(folder: RunFolder, shard: Shard, failed: TaskError, log: RunLog) ->
     if isinstance(failed.cause, UserError):
         raise failed.cause
     if isinstance(failed.cause, OSError | MemoryError):
-        raise not_written(folder, shard, getattr(failed.cause, "strerror", None) or str(failed.cause))
+        raise not_written(folder, shard, failed.cause)
     record_failure(folder, shard, failed.error, failed.trace, log)
 
 

@@ -12,6 +12,7 @@ import pandas as pd
 
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files.extras import optional
+from uavmec_jax.files.locations import local_path
 from uavmec_jax.files.writing import write_text
 from uavmec_jax.search.halving import SuccessiveHalving, TrialOutcome
 from uavmec_jax.search.space import (
@@ -95,7 +96,7 @@ def run_search(
 
     Args:
         space: from :func:`uavmec_jax.search.space.load_space`.
-        directory: folder of the search: its database, table and best settings.
+        directory: folder of the search, on this machine: its database, table and best settings.
         command: the command line, for the label.
         on_progress: called while batches train.
 
@@ -104,7 +105,7 @@ def run_search(
             fit in memory.
     """
     optuna = _import_optuna()
-    path = Path(directory)
+    path = local_path(directory, "the database of a search")
     _check_directory(path, space)
     path.mkdir(parents=True, exist_ok=True)
     write_text(path / FACTS, json.dumps({"space": space.model_dump(mode="json"), "command": command} | host.describe()))
