@@ -12,6 +12,7 @@ import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, cast
 
@@ -135,6 +136,27 @@ def remove_folder(path: Path) -> None:
         return
     with suppress(OSError), store_errors():
         file_system(path).rm(path_in_store(path), recursive=True)
+
+
+def names_in(folder: Path) -> list[str]:
+    """Return the sorted names of the files and folders in a folder; none if it does not exist.
+
+    Of a store, ``glob`` and ``is_file`` hide what goes wrong: then there is no file. Listing and ``exists`` do not.
+    """
+    if is_local(folder):
+        return sorted(file.name for file in folder.iterdir()) if folder.is_dir() else []
+    top = path_in_store(folder)
+    try:
+        with store_errors():
+            names = {name.removeprefix(top).strip("/") for name in file_system(folder).ls(top, detail=False)}
+    except FileNotFoundError:
+        return []
+    return sorted(names - {""})  # the empty object by which consoles of stores show a folder
+
+
+def files_matching(folder: Path, pattern: str) -> list[Path]:
+    """Return the files in a folder whose names match a pattern, sorted by name; none if the folder does not exist."""
+    return [folder / name for name in names_in(folder) if fnmatchcase(name, pattern)]
 
 
 def files_in_subfolders(folder: Path) -> Iterable[Path]:

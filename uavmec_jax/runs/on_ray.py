@@ -13,7 +13,7 @@ from typing import Any
 from uavmec_jax.cluster.connection import Cluster, cpus_per_shard, n_cores
 from uavmec_jax.cluster.tasks import Task, TaskError, TaskRun
 from uavmec_jax.errors import StudyError, UserError
-from uavmec_jax.files.locations import absolute, to_path
+from uavmec_jax.files.locations import absolute, files_matching, to_path
 from uavmec_jax.runs.attempt import Attempt
 from uavmec_jax.runs.folder import CHECKPOINT, LOG, RunFolder
 from uavmec_jax.runs.in_process import OnProgress, not_written, record_failure
@@ -71,7 +71,7 @@ def run_on_ray(
             return absolute(folder.path), shard.number, attempt, _Worker.of(cluster, other_code)
 
         def position() -> list[str]:
-            return sorted(file.name for file in folder.shard_folder(shard).glob(f"{CHECKPOINT}-*.npz"))
+            return [file.name for file in files_matching(folder.shard_folder(shard), f"{CHECKPOINT}-*.npz")]
 
         return Task(shard.number, attempt_shard, arguments, position)
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from uavmec_jax.errors import StudyError
-from uavmec_jax.files.locations import reached, remove_folder
+from uavmec_jax.files.locations import names_in, reached, remove_folder
 from uavmec_jax.files.locks import describe_process, owner_of
 from uavmec_jax.files.writing import set_aside
 from uavmec_jax.runs.folder import RUN_PLAN, SHARDS, TOUR, RunFolder
@@ -39,7 +39,7 @@ def check_empty(directory: Path) -> None:
         )
     if (directory / TOUR).exists():
         raise StudyError(f"{directory}: already holds a tour of `uavmec plan`; give another folder with --out")
-    if directory.exists() and not (directory.is_dir() and all(file.name == SHARDS for file in directory.iterdir())):
+    if directory.exists() and not (directory.is_dir() and set(names_in(directory)) <= {SHARDS}):
         raise StudyError(f"{directory}: exists and is not an empty folder; give another one with --out")
 
 

@@ -41,7 +41,7 @@ def read_results(directory: Path) -> Results:
 def _read_run(directory: Path) -> dict[str, Any]:
     """Read ``run.json``."""
     path = directory / RUN
-    if not path.is_file():
+    if not path.exists():
         raise StudyError(f"{directory}: holds no run ({RUN} is missing)")
     try:
         run: dict[str, Any] = json.loads(read_text(path, StudyError))
@@ -57,7 +57,7 @@ def _check_digests(directory: Path, run: dict[str, Any]) -> None:
     """Check that the files are as the run wrote them."""
     for name, digest in run.get("sha256", {}).items():
         path = directory / name
-        if path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() != digest:
+        if path.exists() and hashlib.sha256(path.read_bytes()).hexdigest() != digest:
             raise StudyError(f"{path}: cannot be read: was altered or damaged since the run wrote it")
 
 

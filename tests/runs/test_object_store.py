@@ -1,0 +1,309 @@
+"""Runs in object stores: one in memory, and one that speaks the S3 protocol, in a server on this machine."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import boto3
+import fsspec
+import jax
+import moto.settings
+import numpy as np
+import pytest
+import s3fs
+from click.testing import CliRunner
+from moto.server import ThreadedMotoServer
+
+import uavmec_jax as um
+from tests.runs.processes import FINAL, TINY, bits, environment, events, start, stop_after, uavmec
+from uavmec_jax.cli import main
+from uavmec_jax.errors import PolicyError, StudyError
+from uavmec_jax.files.locations import to_path
+from uavmec_jax.files.locks import OWNER, lock_folder
+from uavmec_jax.files.writing import create_exclusively, write_text
+from uavmec_jax.runs.folder import SHARDS
+from uavmec_jax.runs.options import RunOptions
+from uavmec_jax.runs.run import resume_run, run_study
+from uavmec_jax.studies.results_files import load_weights
+from uavmec_jax.studies.study import parse_study
+
+STUDY = parse_study(TINY, "tiny")
+BUCKET = "bucket"
+
+
+@pytest.fixture(scope="module")
+def server():
+    """The address of an S3-compatible server with one bucket; the store's package and all subprocesses use it."""
+    moto = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    moto.start()
+    address = "http://{}:{}".format(*moto.get_host_and_port())
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in {
+            "AWS_ENDPOINT_URL": address,
+            "AWS_ACCESS_KEY_ID": "test",
+            "AWS_SECRET_ACCESS_KEY": "test",
+            "AWS_DEFAULT_REGION": "us-east-1",
+            "AWS_EC2_METADATA_DISABLED": "true",  # else credentials are looked for in the network
+            "AWS_CONFIG_FILE": os.devnull,
+            "AWS_SHARED_CREDENTIALS_FILE": os.devnull,
+        }.items():
+            patch.setenv(name, value)
+        boto3.client("s3").create_bucket(Bucket=BUCKET)
+        s3fs.S3FileSystem.clear_instance_cache()
+        yield address
+        s3fs.S3FileSystem.clear_instance_cache()
+    moto.stop()
+
+
+@pytest.fixture
+def memory():
+    """The URL of a run in the memory of this process."""
+    store = fsspec.filesystem("memory")
+    store.rm("/", recursive=True)
+    yield "memory://tests/run"
+    store.rm("/", recursive=True)
+
+
+def in_other_process(code, *arguments):
+    """Start Python code that prints a line when it is ready."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *arguments],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=environment(),
+    )
+    assert process.stdout.readline() == "ready\n"
+    return process
+
+
+WRITE = """
+import sys
+from uavmec_jax.files.locations import to_path
+from uavmec_jax.files.writing import write_text
+write_text(to_path(sys.argv[1]), sys.argv[2])
+print("ready")
+"""
+
+LOCK = """
+import sys
+from uavmec_jax.files.locations import to_path
+from uavmec_jax.files.locks import lock_folder
+path = to_path(sys.argv[1])
+with lock_folder(path, path):
+    print("ready", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_files_of_another_process_are_seen_at_once(server):
+    """The package of the store keeps listings of folders unless it is told not to."""
+    folder = to_path(f"s3://{BUCKET}/listed")
+    write_text(folder / "shard" / "a", "1")
+    seen = [(sorted(file.name for file in (folder / "shard").glob("*")), (folder / "shard" / "b").exists())]
+    for name, text in (("b", "2"), ("a", "3")):
+        with in_other_process(WRITE, str(folder / "shard" / name), text):
+            pass
+        seen.append((sorted(file.name for file in (folder / "shard").iterdir()), (folder / "shard" / "b").exists()))
+    assert seen == [(["a"], False), (["a", "b"], True), (["a", "b"], True)]
+    assert (folder / "shard" / "a").read_text(encoding="utf-8") == "3"
+
+
+def test_two_processes_do_not_work_in_one_folder(server):
+    folder = to_path(f"s3://{BUCKET}/locked")
+    with in_other_process(LOCK, str(folder)) as other:
+        refused = rf"^s3://{BUCKET}/locked: process {other.pid} on \S+ is working in it"
+        with pytest.raises(StudyError, match=refused), lock_folder(folder, folder):
+            pass
+        assert not create_exclusively(folder / OWNER, b"")  # nor if both find the folder free
+        other.kill()
+    with lock_folder(folder, folder):  # its process is known to be dead
+        assert (folder / OWNER).exists()
+    assert not folder.exists()
+
+
+def test_a_folder_made_in_a_console_takes_a_run(server):
+    """Consoles of stores show a folder by an empty object whose name ends with a slash."""
+    boto3.client("s3").put_object(Bucket=BUCKET, Key="empty/", Body=b"")
+    with pytest.raises(StudyError, match="cannot be found as a test"):
+        run_study(STUDY, f"s3://{BUCKET}/empty", on_plan=_stop)
+    write_text(to_path(f"s3://{BUCKET}/full/notes"), "")
+    with pytest.raises(StudyError, match=rf"^s3://{BUCKET}/full: exists and is not an empty folder"):
+        run_study(STUDY, f"s3://{BUCKET}/full", on_plan=_stop)
+
+
+def _stop(plan):
+    raise StudyError("cannot be found as a test")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "changes", "line"),
+    [
+        (["run", "tiny.toml", "--out", "s3://no-such-bucket/run"], {}, "The specified bucket does not exist"),
+        (["resume", "s3://no-such-bucket/run"], {}, "holds no run that can be resumed"),
+        (["status", f"s3://{BUCKET}/nothing"], {}, "holds no run that can be resumed"),
+        (["show", f"s3://{BUCKET}/nothing"], {}, "holds no run (run.json is missing)"),
+        (["evaluate", f"s3://{BUCKET}/nothing"], {}, "neither a file nor a policy by name"),
+        (["run", "tiny.toml", "--out", "s3://Bad!/run"], {}, 'Invalid bucket name "Bad!"'),
+        (
+            ["run", "tiny.toml", "--out", f"s3://{BUCKET}/run"],
+            {"AWS_ENDPOINT_URL": "http://127.0.0.1:9"},
+            "Could not connect",
+        ),
+        (["evaluate", f"s3://{BUCKET}/run"], {"AWS_ENDPOINT_URL": "http://127.0.0.1:9"}, "Could not connect"),
+        (["run", "tiny.toml", "--out", "nothing://a/run"], {}, "nothing://a/run: Unsupported filesystem: 'nothing'"),
+        (["run", "tiny.toml", "--out", f"s3://{BUCKET}/run", "--tensorboard"], {}, "--tensorboard writes files beside"),
+        (["run", "tiny.toml", "--out", "memory://a/run", "--ray", "local"], {}, "the memory of one process"),
+        (["search", "dqn", "--out", f"s3://{BUCKET}/search"], {}, "is in an object store, where only runs can be"),
+        (["plan", "--out", f"s3://{BUCKET}/plan"], {}, "is in an object store, where only runs can be"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line(server, tmp_path, monkeypatch, arguments, changes, line):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("AWS_MAX_ATTEMPTS", "1")
+    (tmp_path / "tiny.toml").write_text(TINY)
+    for name, value in changes.items():
+        monkeypatch.setenv(name, value)
+    s3fs.S3FileSystem.clear_instance_cache()  # its sessions have the former settings
+    done = CliRunner().invoke(main, arguments)
+    monkeypatch.undo()
+    s3fs.S3FileSystem.clear_instance_cache()
+    assert done.exit_code == 2, done.output
+    assert done.stderr.startswith("uavmec: ")
+    assert done.stderr.count("\n") == 1
+    assert line in done.stderr
+    assert [file.name for file in tmp_path.iterdir()] == ["tiny.toml"]
+    assert boto3.client("s3").list_objects_v2(Bucket=BUCKET, Prefix="run/")["KeyCount"] == 0
+
+
+@pytest.fixture
+def strict(server, monkeypatch):
+    """The server, which now checks who asks, and knows nobody."""
+    s3fs.S3FileSystem.clear_instance_cache()
+    monkeypatch.setattr(moto.settings, "INITIAL_NO_AUTH_ACTION_COUNT", 0.0)
+    yield
+    s3fs.S3FileSystem.clear_instance_cache()
+
+
+@pytest.mark.parametrize("keys", [True, False])
+def test_without_credentials(strict, monkeypatch, keys):
+    if not keys:
+        monkeypatch.delenv("AWS_ACCESS_KEY_ID")
+        monkeypatch.delenv("AWS_SECRET_ACCESS_KEY")
+    for call in (um.load_results, um.runs.run_status, um.runs.resume_run, lambda url: run_study(STUDY, url)):
+        with pytest.raises(
+            StudyError, match=rf"^s3://{BUCKET}/run: .*(Forbidden|Denied|not exist|credentials)"
+        ) as refused:
+            call(f"s3://{BUCKET}/run")
+        assert "\n" not in str(refused.value)
+
+
+def test_what_python_callers_are_told(server):
+    for load, error in ((um.load_results, StudyError), (load_weights, PolicyError), (um.load_policy, PolicyError)):
+        with pytest.raises(error, match=rf"^s3://{BUCKET}/nothing[:/]"):
+            load(f"s3://{BUCKET}/nothing")
+    with pytest.raises(StudyError, match=r"^s3://no-such-bucket/run: The specified bucket does not exist$"):
+        run_study(STUDY, "s3://no-such-bucket/run")
+    with pytest.raises(StudyError, match="--tensorboard"):
+        run_study(STUDY, f"s3://{BUCKET}/run", options=RunOptions(tensorboard=True))
+
+
+@pytest.fixture(scope="module")
+def local(tmp_path_factory):
+    """A run in a folder of this machine, in this process."""
+    directory = tmp_path_factory.mktemp("local") / "run"
+    run_study(STUDY, directory, shard_size=2)
+    return directory
+
+
+@pytest.mark.slow
+def test_a_run_in_memory_is_that_of_a_folder(memory, local, tmp_path, monkeypatch):
+    events_seen = []
+    stopped = run_study(STUDY, memory, shard_size=2, on_progress=stop_after(2))
+    assert not stopped.run["complete"]
+    status = um.runs.run_status(memory)
+    assert (status.directory, status.complete, status.owner, status.shards["stopped"]) == (memory, False, "", 1)
+    assert status.disk_bytes > 1000
+    assert len(um.load_results(memory).agents) == 0
+    results = resume_run(memory, on_event=lambda event, facts: events_seen.append(event))
+    assert "restored" in events_seen
+    assert bits(to_path(memory)) == bits(local)
+    assert not (to_path(memory) / SHARDS).exists()
+    assert um.runs.run_status(memory).shards["done"] == 2
+    assert len(resume_run(memory).agents) == 4
+    with pytest.raises(StudyError, match=f"^{memory}: already holds a run"):
+        run_study(STUDY, memory)
+
+    assert um.load_results(memory).agents.equals(um.load_results(local).agents)
+    for ours, theirs in zip(
+        jax_leaves(load_weights(memory, "last")), jax_leaves(load_weights(str(local), "last")), strict=True
+    ):
+        np.testing.assert_array_equal(ours, theirs)
+    policy = um.load_policy(memory, powered=4, seed=1)
+    policy.save("memory://tests/policy.npz")
+    assert um.load_policy("memory://tests/policy.npz").trained_on == policy.trained_on
+    results.save("memory://tests/copy")
+    assert bits(to_path("memory://tests/copy")) == bits(local)
+
+    monkeypatch.chdir(tmp_path)
+    chosen = ["--powered", "4", "--connected", "8", "--draws", "2"]
+    for arguments, text in (
+        (["resume", memory], "Files: memory://tests/run"),
+        (["show", memory], "Files: memory://tests/run"),
+        (["status", memory], "complete"),
+        (["compare", memory, str(local)], "run"),
+        (["evaluate", memory, *chosen, "--save", "memory://tests/saved.npz"], "Trained by A2C on"),
+        (["evaluate", "memory://tests/saved.npz", *chosen], "Trained by A2C on"),
+    ):
+        done = CliRunner().invoke(main, arguments)
+        assert done.exit_code == 0, done.output
+        assert text in done.stdout
+    assert to_path(memory + "/figure.png").read_bytes().startswith(b"\x89PNG")
+    assert list(tmp_path.iterdir()) == []
+
+
+def jax_leaves(tree):
+    return jax.tree.leaves(tree)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_run_that_was_stopped_continues_in_another_process(server, tmp_path_factory, number):
+    """Over the S3 protocol; the bits are those of a run in a folder."""
+    folder = tmp_path_factory.mktemp("s3")
+    (folder / "tiny.toml").write_text(TINY)
+    long = ["--set", "steps=60000", "--shard-size", "2", "--checkpoint-every", "0", "--checkpoint-share", "0.5"]
+    uavmec("run", "tiny.toml", *long, "--out", "whole", cwd=folder)
+    url = f"s3://{BUCKET}/stopped-{number}"
+    process = start("run", "tiny.toml", *long, "--out", url, cwd=folder)
+    wait_for_checkpoint(process, to_path(url))
+    assert f"process {process.pid} on" in json.loads(uavmec("status", url, "--json", cwd=folder).stdout)["owner"]
+    refused = uavmec("resume", url, cwd=folder, check=False)
+    assert refused.returncode == 2
+    assert f"{url}: process {process.pid} on" in refused.stderr
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=120)
+    if number == signal.SIGTERM:
+        assert process.returncode == 128 + signal.SIGTERM
+        assert f"resume with: uavmec resume {url}" in errors
+    else:
+        assert process.returncode == -signal.SIGKILL
+    status = json.loads(uavmec("status", url, "--json", cwd=folder).stdout)
+    assert (status["complete"], status["owner"], status["shards"]["running"]) == (False, "", 0)
+    assert "resumes from checkpoint" in uavmec("resume", url, cwd=folder).stdout
+    assert bits(to_path(url)) == bits(folder / "whole")
+    assert len(events(to_path(url), "restored")) >= 1
+    names = {file.name for file in to_path(url).iterdir()}
+    assert names == {*FINAL, "run.json", "run_plan.json", "figure.png", "log"}
+    assert sorted(file.name for file in folder.iterdir()) == ["tiny.toml", "whole"]
+
+
+def wait_for_checkpoint(process, path):
+    until = time.monotonic() + 120
+    while not list((path / SHARDS).glob("*/checkpoint-*")):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < until
+        time.sleep(0.05)
