@@ -238,10 +238,7 @@ def test_a_run_in_memory_is_that_of_a_folder(memory, local, tmp_path, monkeypatc
         run_study(STUDY, memory)
 
     assert um.load_results(memory).agents.equals(um.load_results(local).agents)
-    for ours, theirs in zip(
-        jax_leaves(load_weights(memory, "last")), jax_leaves(load_weights(str(local), "last")), strict=True
-    ):
-        np.testing.assert_array_equal(ours, theirs)
+    jax.tree.map(np.testing.assert_array_equal, load_weights(memory, "last"), load_weights(str(local), "last"))
     policy = um.load_policy(memory, powered=4, seed=1)
     policy.save("memory://tests/policy.npz")
     assert um.load_policy("memory://tests/policy.npz").trained_on == policy.trained_on
@@ -254,7 +251,7 @@ def test_a_run_in_memory_is_that_of_a_folder(memory, local, tmp_path, monkeypatc
         (["resume", memory], "Files: memory://tests/run"),
         (["show", memory], "Files: memory://tests/run"),
         (["status", memory], "complete"),
-        (["compare", memory, str(local)], "run"),
+        (["compare", memory, str(local)], "seed by seed"),
         (["evaluate", memory, *chosen, "--save", "memory://tests/saved.npz"], "Trained by A2C on"),
         (["evaluate", "memory://tests/saved.npz", *chosen], "Trained by A2C on"),
     ):
@@ -265,26 +262,33 @@ def test_a_run_in_memory_is_that_of_a_folder(memory, local, tmp_path, monkeypatc
     assert list(tmp_path.iterdir()) == []
 
 
-def jax_leaves(tree):
-    return jax.tree.leaves(tree)
+TRAINED_LONG = ["--set", "steps=60000", "--shard-size", "2", "--checkpoint-every", "0", "--checkpoint-share", "0.5"]
+"""Two shards of a second or two, with checkpoints as often as they are cheap."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with a study, and with a run of it in a process of its own."""
+    folder = tmp_path_factory.mktemp("s3")
+    (folder / "tiny.toml").write_text(TINY)
+    uavmec("run", "tiny.toml", *TRAINED_LONG, "--out", "whole", cwd=folder)
+    return folder
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
-def test_a_run_that_was_stopped_continues_in_another_process(server, tmp_path_factory, number):
+def test_a_run_that_was_stopped_continues_in_another_process(server, folder, number):
     """Over the S3 protocol; the bits are those of a run in a folder."""
-    folder = tmp_path_factory.mktemp("s3")
-    (folder / "tiny.toml").write_text(TINY)
-    long = ["--set", "steps=60000", "--shard-size", "2", "--checkpoint-every", "0", "--checkpoint-share", "0.5"]
-    uavmec("run", "tiny.toml", *long, "--out", "whole", cwd=folder)
     url = f"s3://{BUCKET}/stopped-{number}"
-    process = start("run", "tiny.toml", *long, "--out", url, cwd=folder)
+    process = start("run", "tiny.toml", *TRAINED_LONG, "--out", url, cwd=folder)
     wait_for_checkpoint(process, to_path(url))
+    process.send_signal(signal.SIGSTOP)  # it is alive, and does not finish while others look
     assert f"process {process.pid} on" in json.loads(uavmec("status", url, "--json", cwd=folder).stdout)["owner"]
     refused = uavmec("resume", url, cwd=folder, check=False)
     assert refused.returncode == 2
     assert f"{url}: process {process.pid} on" in refused.stderr
     process.send_signal(number)
+    process.send_signal(signal.SIGCONT)
     _, errors = process.communicate(timeout=120)
     if number == signal.SIGTERM:
         assert process.returncode == 128 + signal.SIGTERM

@@ -1,6 +1,8 @@
 """Readers of text, JSON and TOML files whose errors are one line that names the file."""
 
+import errno
 import json
+import os
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,8 @@ def read_text(path: Path, error: type[UserError], encoding: str = "utf-8") -> st
     try:
         with store_errors():
             return path.read_text(encoding=encoding)
+    except FileNotFoundError:  # stores give no reason
+        raise error(f"{path}: cannot be read: {os.strerror(errno.ENOENT)}") from None
     except (OSError, UnicodeDecodeError) as problem:
         reason = reason_of(problem) if isinstance(problem, OSError) else str(problem)
         raise error(f"{path}: cannot be read: {reason}") from None
