@@ -1,70 +1,32 @@
 """Runs in object stores: one in memory, and one that speaks the S3 protocol, in a server on this machine."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
 import time
 
-import boto3
-import fsspec
 import jax
-import moto.settings
 import numpy as np
 import pytest
-import s3fs
 from click.testing import CliRunner
-from moto.server import ThreadedMotoServer
 
 import uavmec_jax as um
+from tests.runs.object_stores import BUCKET, memory_store, s3_server
 from tests.runs.processes import FINAL, TINY, bits, environment, events, start, stop_after, uavmec
 from uavmec_jax.cli import main
-from uavmec_jax.errors import PolicyError, StudyError
+from uavmec_jax.errors import StudyError
 from uavmec_jax.files.locations import to_path
 from uavmec_jax.files.locks import OWNER, lock_folder
 from uavmec_jax.files.writing import create_exclusively, write_text
 from uavmec_jax.runs.folder import SHARDS
-from uavmec_jax.runs.options import RunOptions
 from uavmec_jax.runs.run import resume_run, run_study
 from uavmec_jax.studies.results_files import load_weights
 from uavmec_jax.studies.study import parse_study
 
 STUDY = parse_study(TINY, "tiny")
-BUCKET = "bucket"
-
-
-@pytest.fixture(scope="module")
-def server():
-    """The address of an S3-compatible server with one bucket; the store's package and all subprocesses use it."""
-    moto = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-    moto.start()
-    address = "http://{}:{}".format(*moto.get_host_and_port())
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in {
-            "AWS_ENDPOINT_URL": address,
-            "AWS_ACCESS_KEY_ID": "test",
-            "AWS_SECRET_ACCESS_KEY": "test",
-            "AWS_DEFAULT_REGION": "us-east-1",
-            "AWS_EC2_METADATA_DISABLED": "true",  # else credentials are looked for in the network
-            "AWS_CONFIG_FILE": os.devnull,
-            "AWS_SHARED_CREDENTIALS_FILE": os.devnull,
-        }.items():
-            patch.setenv(name, value)
-        boto3.client("s3").create_bucket(Bucket=BUCKET)
-        s3fs.S3FileSystem.clear_instance_cache()
-        yield address
-        s3fs.S3FileSystem.clear_instance_cache()
-    moto.stop()
-
-
-@pytest.fixture
-def memory():
-    """The URL of a run in the memory of this process."""
-    store = fsspec.filesystem("memory")
-    store.rm("/", recursive=True)
-    yield "memory://tests/run"
-    store.rm("/", recursive=True)
+server = pytest.fixture(scope="module")(s3_server)
+memory = pytest.fixture(memory_store)
 
 
 def in_other_process(code, *arguments):
@@ -125,92 +87,6 @@ def test_two_processes_do_not_work_in_one_folder(server):
     assert not folder.exists()
 
 
-def test_a_folder_made_in_a_console_takes_a_run(server):
-    """Consoles of stores show a folder by an empty object whose name ends with a slash."""
-    boto3.client("s3").put_object(Bucket=BUCKET, Key="empty/", Body=b"")
-    with pytest.raises(StudyError, match="cannot be found as a test"):
-        run_study(STUDY, f"s3://{BUCKET}/empty", on_plan=_stop)
-    write_text(to_path(f"s3://{BUCKET}/full/notes"), "")
-    with pytest.raises(StudyError, match=rf"^s3://{BUCKET}/full: exists and is not an empty folder"):
-        run_study(STUDY, f"s3://{BUCKET}/full", on_plan=_stop)
-
-
-def _stop(plan):
-    raise StudyError("cannot be found as a test")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "changes", "line"),
-    [
-        (["run", "tiny.toml", "--out", "s3://no-such-bucket/run"], {}, "The specified bucket does not exist"),
-        (["resume", "s3://no-such-bucket/run"], {}, "holds no run that can be resumed"),
-        (["status", f"s3://{BUCKET}/nothing"], {}, "holds no run that can be resumed"),
-        (["show", f"s3://{BUCKET}/nothing"], {}, "holds no run (run.json is missing)"),
-        (["evaluate", f"s3://{BUCKET}/nothing"], {}, "neither a file nor a policy by name"),
-        (["run", "tiny.toml", "--out", "s3://Bad!/run"], {}, 'Invalid bucket name "Bad!"'),
-        (
-            ["run", "tiny.toml", "--out", f"s3://{BUCKET}/run"],
-            {"AWS_ENDPOINT_URL": "http://127.0.0.1:9"},
-            "Could not connect",
-        ),
-        (["evaluate", f"s3://{BUCKET}/run"], {"AWS_ENDPOINT_URL": "http://127.0.0.1:9"}, "Could not connect"),
-        (["run", "tiny.toml", "--out", "nothing://a/run"], {}, "nothing://a/run: Unsupported filesystem: 'nothing'"),
-        (["run", "tiny.toml", "--out", f"s3://{BUCKET}/run", "--tensorboard"], {}, "--tensorboard writes files beside"),
-        (["run", "tiny.toml", "--out", "memory://a/run", "--ray", "local"], {}, "the memory of one process"),
-        (["search", "dqn", "--out", f"s3://{BUCKET}/search"], {}, "is in an object store, where only runs can be"),
-        (["plan", "--out", f"s3://{BUCKET}/plan"], {}, "is in an object store, where only runs can be"),
-    ],
-)
-def test_what_cannot_be_done_is_one_line(server, tmp_path, monkeypatch, arguments, changes, line):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("AWS_MAX_ATTEMPTS", "1")
-    (tmp_path / "tiny.toml").write_text(TINY)
-    for name, value in changes.items():
-        monkeypatch.setenv(name, value)
-    s3fs.S3FileSystem.clear_instance_cache()  # its sessions have the former settings
-    done = CliRunner().invoke(main, arguments)
-    monkeypatch.undo()
-    s3fs.S3FileSystem.clear_instance_cache()
-    assert done.exit_code == 2, done.output
-    assert done.stderr.startswith("uavmec: ")
-    assert done.stderr.count("\n") == 1
-    assert line in done.stderr
-    assert [file.name for file in tmp_path.iterdir()] == ["tiny.toml"]
-    assert boto3.client("s3").list_objects_v2(Bucket=BUCKET, Prefix="run/")["KeyCount"] == 0
-
-
-@pytest.fixture
-def strict(server, monkeypatch):
-    """The server, which now checks who asks, and knows nobody."""
-    s3fs.S3FileSystem.clear_instance_cache()
-    monkeypatch.setattr(moto.settings, "INITIAL_NO_AUTH_ACTION_COUNT", 0.0)
-    yield
-    s3fs.S3FileSystem.clear_instance_cache()
-
-
-@pytest.mark.parametrize("keys", [True, False])
-def test_without_credentials(strict, monkeypatch, keys):
-    if not keys:
-        monkeypatch.delenv("AWS_ACCESS_KEY_ID")
-        monkeypatch.delenv("AWS_SECRET_ACCESS_KEY")
-    for call in (um.load_results, um.runs.run_status, um.runs.resume_run, lambda url: run_study(STUDY, url)):
-        with pytest.raises(
-            StudyError, match=rf"^s3://{BUCKET}/run: .*(Forbidden|Denied|not exist|credentials)"
-        ) as refused:
-            call(f"s3://{BUCKET}/run")
-        assert "\n" not in str(refused.value)
-
-
-def test_what_python_callers_are_told(server):
-    for load, error in ((um.load_results, StudyError), (load_weights, PolicyError), (um.load_policy, PolicyError)):
-        with pytest.raises(error, match=rf"^s3://{BUCKET}/nothing[:/]"):
-            load(f"s3://{BUCKET}/nothing")
-    with pytest.raises(StudyError, match=r"^s3://no-such-bucket/run: The specified bucket does not exist$"):
-        run_study(STUDY, "s3://no-such-bucket/run")
-    with pytest.raises(StudyError, match="--tensorboard"):
-        run_study(STUDY, f"s3://{BUCKET}/run", options=RunOptions(tensorboard=True))
-
-
 @pytest.fixture(scope="module")
 def local(tmp_path_factory):
     """A run in a folder of this machine, in this process."""
@@ -260,6 +136,30 @@ def test_a_run_in_memory_is_that_of_a_folder(memory, local, tmp_path, monkeypatc
         assert text in done.stdout
     assert to_path(memory + "/figure.png").read_bytes().startswith(b"\x89PNG")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_a_store_that_fails_ends_the_run_and_no_shard(memory, local, monkeypatch):
+    store = type(to_path(memory).fs)
+    put, error = store.put_file, type("ConnectError", (Exception,), {"__module__": "botocore.exceptions"})
+
+    def fail(self, local, path, **options):
+        if "/00001/result-" in path:
+            raise error("no route to the store")
+        return put(self, local, path, **options)
+
+    monkeypatch.setattr(store, "put_file", fail)
+    with pytest.raises(StudyError) as failed:
+        run_study(STUDY, memory, shard_size=2)
+    monkeypatch.undo()
+    assert str(failed.value) == (
+        f"{memory}/shards/00001: cannot be written: no route to the store; earlier checkpoints are intact; when the store "
+        f"can be reached, resume with: uavmec resume {memory}"
+    )
+    status = um.runs.run_status(memory)
+    assert (status.shards["done"], status.shards["failed"], status.owner) == (1, 0, "")
+    resume_run(memory)
+    assert bits(to_path(memory)) == bits(local)
 
 
 TRAINED_LONG = ["--set", "steps=60000", "--shard-size", "2", "--checkpoint-every", "0", "--checkpoint-share", "0.5"]
