@@ -5,15 +5,20 @@ Constructors of pytrees are not checked, since JAX also calls them with shapes a
 
 import dataclasses
 import functools
+from pathlib import Path
 from typing import Any, get_args
 
 import jax
 import numpy as np
-from beartype import BeartypeConf, beartype
+from beartype import BeartypeConf, FrozenDict, beartype
 from beartype.door import is_bearable
 from jaxtyping import AbstractArray, TypeCheckError, jaxtyped
+from upath import UPath
 
-_CONF = BeartypeConf(is_pep484_tower=True)  # an int is accepted where a float is asked for
+_CONF = BeartypeConf(
+    is_pep484_tower=True,  # an int is accepted where a float is asked for
+    hint_overrides=FrozenDict({Path: Path | UPath}),  # and the path of an object store where a path is
+)
 _LEAVES = (jax.Array, np.ndarray, np.generic, int, float)
 _passed: set[tuple] = set()
 """Signatures of pytrees that passed the check."""

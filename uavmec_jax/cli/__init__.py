@@ -13,6 +13,7 @@ from uavmec_jax.cli.search import search
 from uavmec_jax.cli.studies import compare, run, show, validate
 from uavmec_jax.cli.traffic import traffic
 from uavmec_jax.errors import UserError
+from uavmec_jax.files.locations import store_errors
 
 
 class UavmecGroup(click.Group):
@@ -22,10 +23,11 @@ class UavmecGroup(click.Group):
         """Run the command.
 
         Raises:
-            InputError: a UserError or an OSError ended it.
+            InputError: a UserError or an OSError ended it, or what an object store could not do.
         """
         try:
-            return super().invoke(ctx)
+            with store_errors():
+                return super().invoke(ctx)
         except UserError as error:
             raise InputError(str(error)) from error
         except OSError as error:

@@ -13,13 +13,24 @@ from uavmec_jax.cluster.options import RayOptions
 from uavmec_jax.runs.options import CHECKPOINT_KINDS, RunOptions
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON on standard output.")
-out_option = functools.partial(click.option, "--out", type=click.Path(path_type=Path))
 
 
-class FolderOfRun(click.ParamType):
-    """A folder on this machine, or the URL of one in an object store."""
+class LocalPath(click.Path):
+    """A path of this machine."""
 
-    name = "folder"
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the path, and refuse a URL, of which a path would be made."""
+        from uavmec_jax.files.locations import is_url
+
+        if is_url(value):
+            raise InputError(f"{value}: is in an object store, where only runs can be; give a path of this machine")
+        return super().convert(value, param, ctx)
+
+
+class Location(click.ParamType):
+    """A path of this machine, or a URL of an object store."""
+
+    name = "path"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the path."""
@@ -28,6 +39,13 @@ class FolderOfRun(click.ParamType):
         return to_path(value)
 
 
+class FolderOfRun(Location):
+    """A folder on this machine, or the URL of one in an object store."""
+
+    name = "folder"
+
+
+out_option = functools.partial(click.option, "--out", type=LocalPath(path_type=Path))
 run_folder_option = functools.partial(click.option, "--out", type=FolderOfRun())
 directory_argument = click.argument("directory", type=FolderOfRun())
 set_option = functools.partial(click.option, "--set", "settings", multiple=True, metavar="NAME=VALUE")

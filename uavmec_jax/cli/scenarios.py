@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from uavmec_jax.cli.common import InputError, assignment, command_line, new_folder, print_json, print_tables
-from uavmec_jax.cli.options import ScenarioChoice, json_option, out_option, scenario_options
+from uavmec_jax.cli.options import Location, ScenarioChoice, json_option, out_option, scenario_options
 
 _MAX_DRAWS = 10_000
 
@@ -59,7 +59,7 @@ def plan(scenario: ScenarioChoice, draws: int, width: int | None, out: Path | No
     metavar="NAME=VALUE",
     help="Which agent of a run, by its axes, e.g. --agent algorithm=ppo.",
 )
-@click.option("--save", type=click.Path(path_type=Path), help="Save the trained policy to a file.")
+@click.option("--save", type=Location(), help="Save the trained policy to a file, a path or a URL.")
 @json_option
 def evaluate(
     policy: str,
@@ -77,16 +77,18 @@ def evaluate(
     _check_draws(draws)
     from rich.console import Console
 
+    from uavmec_jax.files.locations import to_path
     from uavmec_jax.reporting.compare import evaluation_table
     from uavmec_jax.scenarios.policies import TrainedPolicy, draws_scenarios, load_policy
     from uavmec_jax.studies.policy_evaluation import evaluate_policy
 
     axes = dict(assignment(text, "--agent") for text in agent)
-    if Path(policy).is_dir() and scenario.file is None and not draws_scenarios(Path(policy)):
+    folder = to_path(policy)
+    if folder.is_dir() and scenario.file is None and not draws_scenarios(folder):
         axes = scenario.axes | axes
     chosen = load_policy(policy, weights, **axes)
     named = scenario.load()
-    rows = evaluate_policy(chosen, Path(policy).name, named, named.draws(draws))
+    rows = evaluate_policy(chosen, folder.name, named, named.draws(draws))
     trained = chosen if isinstance(chosen, TrainedPolicy) else None
     if save is not None:
         if trained is None:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from uavmec_jax.errors import StudyError, UserError
+from uavmec_jax.files.locations import StoreError, local_copy
 from uavmec_jax.files.writing import write_arrays
 
 _READ_ERRORS = (OSError, ValueError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
@@ -27,10 +28,13 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
 
     Raises:
         StudyError: the file is missing, damaged or of another kind.
+        StoreError: its object store cannot be reached.
     """
     try:
         with _open_archive(path) as archive:
             return {name: archive[name] for name in archive.files}
+    except StoreError:
+        raise
     except _READ_ERRORS as error:
         raise StudyError(f"{path}: cannot be read: {error}") from None
 
@@ -81,11 +85,12 @@ def open_checked(
 
     Raises:
         UserError: the file is missing, damaged, altered, of another kind or of another version; of the type ``error``.
+        StoreError: its object store cannot be reached, which says nothing about the file.
     """
     try:
         with _open_archive(path) as archive:
             yield _check_header(path, archive, schema, kind, error), _Members(archive)
-    except UserError:
+    except (UserError, StoreError):
         raise
     except _READ_ERRORS as problem:
         raise error(f"{path}: cannot be read: {problem}") from None
@@ -94,7 +99,7 @@ def open_checked(
 @contextmanager
 def _open_archive(path: Path) -> Iterator[Any]:
     """Open an ``.npz`` without pickle."""
-    with path.open("rb") as file:
+    with local_copy(path) as local, local.open("rb") as file:
         archive = np.load(file, allow_pickle=False)
         if not isinstance(archive, np.lib.npyio.NpzFile) or archive.zip is None:
             raise ValueError("it holds a single array")

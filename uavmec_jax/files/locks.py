@@ -13,7 +13,7 @@ import socket
 import time
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ import psutil
 from filelock import FileLock, Timeout
 
 from uavmec_jax.errors import StudyError
-from uavmec_jax.files.locations import is_local
+from uavmec_jax.files.locations import is_local, make_folder, store_errors
 from uavmec_jax.files.reading import read_json_or_empty
 from uavmec_jax.files.writing import create_exclusively
 
@@ -73,16 +73,16 @@ def lock_folder(folder: Path, of: Path, *, take_over: bool = False) -> Iterator[
 
     Raises:
         StudyError: another process holds it.
+        OSError: the folder cannot be written to.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     lock = _acquire(folder, of)
     try:
         token = _become_owner(folder, of, take_over, locked=lock is not None)
         try:
             yield
         finally:
-            if read_json_or_empty(folder / OWNER).get("token") == token:
-                (folder / OWNER).unlink(missing_ok=True)
+            _resign(folder / OWNER, token)
     finally:
         if lock is not None:
             lock.release()
@@ -113,8 +113,17 @@ def _become_owner(folder: Path, of: Path, take_over: bool, *, locked: bool) -> s
             raise _in_use(of, owner, "; if that process is dead, give --take-over")
         path.unlink(missing_ok=True)
     if not create_exclusively(path, json.dumps(this_process() | {"token": token}).encode()):
-        raise _in_use(of, read_json_or_empty(path))
+        owner = read_json_or_empty(path)
+        if owner.get("token") != token:  # a store may answer so to a request that it was sent twice
+            raise _in_use(of, owner)
     return token
+
+
+def _resign(path: Path, token: str) -> None:
+    """Remove the owner's file if it still holds the token; if it stays, it names a process that has ended."""
+    with suppress(OSError), store_errors():
+        if read_json_or_empty(path).get("token") == token:
+            path.unlink(missing_ok=True)
 
 
 def _in_use(of: Path, owner: dict[str, Any], more: str = "") -> StudyError:

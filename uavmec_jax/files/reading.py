@@ -1,11 +1,14 @@
 """Readers of text, JSON and TOML files whose errors are one line that names the file."""
 
+import errno
 import json
+import os
 import tomllib
 from pathlib import Path
 from typing import Any
 
 from uavmec_jax.errors import UserError
+from uavmec_jax.files.locations import reason_of, store_errors
 
 
 def read_text(path: Path, error: type[UserError], encoding: str = "utf-8") -> str:
@@ -15,16 +18,20 @@ def read_text(path: Path, error: type[UserError], encoding: str = "utf-8") -> st
         UserError: the file cannot be read or decoded; of the type ``error``.
     """
     try:
-        return path.read_text(encoding=encoding)
+        with store_errors():
+            return path.read_text(encoding=encoding)
+    except FileNotFoundError:  # stores give no reason
+        raise error(f"{path}: cannot be read: {os.strerror(errno.ENOENT)}") from None
     except (OSError, UnicodeDecodeError) as problem:
-        reason = problem.strerror if isinstance(problem, OSError) else str(problem)
+        reason = reason_of(problem) if isinstance(problem, OSError) else str(problem)
         raise error(f"{path}: cannot be read: {reason}") from None
 
 
 def read_json_or_empty(path: Path) -> dict[str, Any]:
     """Read a small JSON object that another process may be writing; empty if it is missing or damaged."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        with store_errors():
+            content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     return content if isinstance(content, dict) else {}

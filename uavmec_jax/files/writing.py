@@ -1,5 +1,6 @@
 """Atomic writes: a file is replaced by a complete new one, or left as it was."""
 
+import errno
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
@@ -9,7 +10,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from uavmec_jax.files.locations import file_system, is_local
+from uavmec_jax.files.locations import StoreError, file_system, is_local, path_in_store, store_errors
 
 
 def write_text(path: Path, text: str) -> None:
@@ -25,15 +26,22 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], *, compressed: bo
 
 
 def create_exclusively(path: Path, content: bytes) -> bool:
-    """Create a small file if there is none, and return whether it was created; of several processes, one succeeds."""
+    """Create a small file if there is none, and return whether it was created; of several processes, one succeeds.
+
+    Raises:
+        OSError: it cannot be written.
+    """
     try:
         if is_local(path):
             with path.open("xb") as file:
                 file.write(content)
         else:
-            file_system(path).pipe_file(path.path, content, mode="create")  # type: ignore[attr-defined]
+            with store_errors():
+                file_system(path).pipe_file(path_in_store(path), content, mode="create")
     except FileExistsError:
         return False
+    except NotImplementedError:  # such as https://
+        raise StoreError(errno.EROFS, "cannot be written to", str(path)) from None
     return True
 
 
@@ -62,10 +70,11 @@ def atomic(path: Path) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="uavmec-") as folder:
         partial = Path(folder) / path.name
         yield partial
-        file_system(path).put_file(str(partial), path.path)  # type: ignore[attr-defined]
+        with store_errors():
+            file_system(path).put_file(str(partial), path_in_store(path))
 
 
 def set_aside(path: Path) -> None:
     """Rename a damaged file, so that it is not read again; another process may have done so before."""
-    with suppress(FileNotFoundError):
+    with suppress(FileNotFoundError), store_errors():
         path.rename(path.with_suffix(".damaged"))

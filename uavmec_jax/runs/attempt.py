@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+from uavmec_jax.files.locations import make_folder, store_errors
 from uavmec_jax.files.locks import this_process
 from uavmec_jax.files.writing import write_text
 from uavmec_jax.runs.checkpoints import Checkpoints
@@ -65,14 +66,15 @@ class Attempt:
             Exception: whatever else went wrong in training or evaluation.
         """
         started = time.monotonic()
-        self.folder.shard_folder(self.shard).mkdir(parents=True, exist_ok=True)
+        make_folder(self.folder.shard_folder(self.shard))
         self.log.event("started", shard=self.shard.number, attempt=self.name)
         self._report("running")
         try:
-            result = self._train_and_evaluate()
-            result.seconds["wall"] = time.monotonic() - started
-            result.write(self.folder.shard_folder(self.shard) / f"{RESULT}-{self.name}.npz")
-            self._checkpoints().remove()
+            with store_errors():
+                result = self._train_and_evaluate()
+                result.seconds["wall"] = time.monotonic() - started
+                result.write(self.folder.shard_folder(self.shard) / f"{RESULT}-{self.name}.npz")
+                self._checkpoints().remove()
         except BaseException as error:
             self.log.event(
                 "stopped", shard=self.shard.number, attempt=self.name, error=f"{type(error).__name__}: {error}"

@@ -8,6 +8,7 @@ from typing import Any
 
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files.archives import open_checked, write_checked
+from uavmec_jax.files.locations import files_matching
 from uavmec_jax.files.writing import set_aside
 from uavmec_jax.runs.folder import CHECKPOINT
 from uavmec_jax.runs.options import CheckpointKind
@@ -119,9 +120,9 @@ class Checkpoints:
 
     def remove(self) -> None:
         """Remove all checkpoints, once the shard is finished."""
-        for path in [*self._generations(), *self.folder.glob(f"{CHECKPOINT}-*.damaged")]:
+        for path in [*self._generations(), *files_matching(self.folder, f"{CHECKPOINT}-*.damaged")]:
             path.unlink(missing_ok=True)
 
     def _generations(self) -> list[Path]:
         """Return the checkpoints of all attempts, the furthest first: after as many chunks, all hold the same state."""
-        return sorted(self.folder.glob(f"{CHECKPOINT}-*.npz"), reverse=True)
+        return files_matching(self.folder, f"{CHECKPOINT}-*.npz")[::-1]

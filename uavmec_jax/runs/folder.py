@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from uavmec_jax.errors import StudyError
+from uavmec_jax.files.locations import files_in_subfolders, files_matching, reached
 from uavmec_jax.files.locks import is_known_dead
 from uavmec_jax.files.reading import read_json_or_empty, read_text
 from uavmec_jax.files.writing import write_text
@@ -74,18 +75,24 @@ class RunFolder:
 
         Raises:
             StudyError: the folder holds no run; the run plan or the study was altered or is damaged; or another version
-                wrote it.
+                wrote it; or its object store cannot be reached.
         """
+        with reached(path):
+            return cls(path, cls._read(path))
+
+    @staticmethod
+    def _read(path: Path) -> dict[str, Any]:
+        """Read and check a run plan."""
         file = path / RUN_PLAN
-        if not file.is_file():
-            tour = f"; it holds a tour of `uavmec plan` ({TOUR})" if (path / TOUR).is_file() else ""
+        if not file.exists():
+            tour = f"; it holds a tour of `uavmec plan` ({TOUR})" if (path / TOUR).exists() else ""
             raise StudyError(f"{path}: holds no run that can be resumed ({RUN_PLAN} is missing){tour}")
         try:
-            facts = json.loads(read_text(file, StudyError))
+            facts: dict[str, Any] = json.loads(read_text(file, StudyError))
             schema, digest = facts["schema"], facts["sha256"]
         except (ValueError, KeyError, TypeError) as error:
             raise StudyError(f"{file}: cannot be read: {error!r}; plan the study anew in another folder") from None
-        if schema == _WITH_LEASES and not (path / RUN).is_file():
+        if schema == _WITH_LEASES and not (path / RUN).exists():
             raise StudyError(f"{path}: was started by a version whose workers held leases; finish it with that version")
         if schema not in (SCHEMA, _WITH_LEASES):
             raise StudyError(f"{file}: schema is {schema!r}; this version reads {SCHEMA}")
@@ -93,7 +100,7 @@ class RunFolder:
             raise StudyError(f"{file}: was altered or damaged: it does not fit its SHA-256; plan the study anew")
         if _sha256(read_text(path / STUDY, StudyError)) != facts["study_sha256"]:
             raise StudyError(f"{path / STUDY}: was altered or damaged since the run was planned; run it as a new study")
-        return cls(path, facts)
+        return facts
 
     @cached_property
     def study(self) -> Study:
@@ -170,7 +177,7 @@ class RunFolder:
 
     def results(self, shard: Shard) -> list[Path]:
         """Return the results of a shard: one from each attempt that finished it, all with the same contents."""
-        return sorted(self.shard_folder(shard).glob(f"{RESULT}-*.npz"))
+        return files_matching(self.shard_folder(shard), f"{RESULT}-*.npz")
 
     def is_closed(self, shard: Shard) -> bool:
         """Return whether a shard is finished or has failed."""
@@ -178,14 +185,14 @@ class RunFolder:
 
     def new_attempt(self, shard: Shard) -> str:
         """Return a name for another attempt at a shard, under which it writes: its number, and what makes it unique."""
-        before = len(list(self.shard_folder(shard).glob(f"{PROGRESS}-*.json")))
+        before = len(files_matching(self.shard_folder(shard), f"{PROGRESS}-*.json"))
         return f"{before + 1:02d}-{secrets.token_hex(3)}"
 
     def states(self) -> Iterator[tuple[Shard, ShardState, dict[str, Any]]]:
         """Yield every shard with its state and what its latest attempt last reported: progress, or why it failed."""
         complete = self.complete
         files: dict[str, list[Path]] = {}
-        for file in () if complete else self.shards_folder.glob("*/*"):
+        for file in () if complete else files_in_subfolders(self.shards_folder):
             files.setdefault(file.parent.name, []).append(file)
         for shard in self.plan.shards:
             present = sorted(files.get(f"{shard.number:05d}", ()), key=lambda file: file.name)

@@ -5,6 +5,7 @@ import traceback
 from collections.abc import Callable
 
 from uavmec_jax.errors import StudyError
+from uavmec_jax.files.locations import is_local, make_folder, reason_of
 from uavmec_jax.files.writing import write_text
 from uavmec_jax.runs.attempt import Attempt
 from uavmec_jax.runs.folder import RunFolder
@@ -35,7 +36,7 @@ def run_here(folder: RunFolder, runner: ShardRunner, stop: StopSignal, log: RunL
             try:
                 attempt.run()
             except (OSError, MemoryError) as error:
-                raise not_written(folder, shard, getattr(error, "strerror", None) or str(error)) from error
+                raise not_written(folder, shard, error) from error
             except Exception as error:
                 record_failure(folder, shard, f"{type(error).__name__}: {error}", traceback.format_exc(), log)
         done += plan.work_of(shard)
@@ -43,14 +44,16 @@ def run_here(folder: RunFolder, runner: ShardRunner, stop: StopSignal, log: RunL
 
 def record_failure(folder: RunFolder, shard: Shard, error: str, trace: str, log: RunLog) -> None:
     """Write why a shard failed, so that the other shards go on without it."""
-    folder.shard_folder(shard).mkdir(parents=True, exist_ok=True)
+    make_folder(folder.shard_folder(shard))
     write_text(folder.failure(shard), json.dumps({"error": error, "traceback": trace}, indent=1) + "\n")
     log.event("failed", shard=shard.number, error=error)
 
 
-def not_written(folder: RunFolder, shard: Shard, reason: str) -> StudyError:
+def not_written(folder: RunFolder, shard: Shard, error: OSError | MemoryError) -> StudyError:
     """Return the error of a run whose files cannot be written."""
+    reason = reason_of(error) if isinstance(error, OSError) else str(error)
+    mended = "there is space" if is_local(folder.path) else "the store can be reached"
     return StudyError(
-        f"{folder.shard_folder(shard)}: cannot be written: {reason}; earlier checkpoints are intact; when there is "
-        f"space, resume with: uavmec resume {folder.path}"
+        f"{folder.shard_folder(shard)}: cannot be written: {reason}; earlier checkpoints are intact; when {mended}, "
+        f"resume with: uavmec resume {folder.path}"
     )

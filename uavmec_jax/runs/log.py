@@ -52,7 +52,7 @@ class RunLog:
             self._logger.addHandler(_JsonLinesHandler(folder / f"{name}.jsonl"))
         else:  # objects cannot be appended to: each log is one that is written anew
             self._logger.addHandler(_JsonObjectHandler(folder / f"{name}-{time.time_ns():x}.jsonl"))
-        if tensorboard:
+        if tensorboard and is_local(folder):  # TensorBoard's own writer knows paths only
             self._logger.addHandler(_TensorBoardHandler(folder.parent / "tensorboard"))
         self._on_event = on_event
 

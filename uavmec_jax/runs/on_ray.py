@@ -12,7 +12,7 @@ from uavmec_jax.cluster.connection import Cluster, cpus_per_shard
 from uavmec_jax.cluster.tasks import Task, TaskError, TaskRun
 from uavmec_jax.cluster.worker import node_name, time_limit
 from uavmec_jax.errors import UserError
-from uavmec_jax.files.locations import absolute, to_path
+from uavmec_jax.files.locations import absolute, files_matching, to_path
 from uavmec_jax.runs.attempt import Attempt
 from uavmec_jax.runs.folder import CHECKPOINT, LOG, RunFolder
 from uavmec_jax.runs.in_process import OnProgress, not_written, record_failure
@@ -57,7 +57,7 @@ def run_on_ray(
             return absolute(folder.path), shard.number, attempt, _Worker.of(cluster, other_code)
 
         def position() -> list[str]:
-            return sorted(file.name for file in folder.shard_folder(shard).glob(f"{CHECKPOINT}-*.npz"))
+            return [file.name for file in files_matching(folder.shard_folder(shard), f"{CHECKPOINT}-*.npz")]
 
         return Task(shard.number, attempt_shard, arguments, position)
 
@@ -82,7 +82,7 @@ def _give_up(folder: RunFolder, shard: Shard, failed: TaskError, log: RunLog) ->
     if isinstance(failed.cause, UserError):
         raise failed.cause
     if isinstance(failed.cause, OSError | MemoryError):
-        raise not_written(folder, shard, getattr(failed.cause, "strerror", None) or str(failed.cause))
+        raise not_written(folder, shard, failed.cause)
     record_failure(folder, shard, failed.error, failed.trace, log)
 
 

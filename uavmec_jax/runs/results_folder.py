@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from uavmec_jax.errors import StudyError
-from uavmec_jax.files.locations import remove_folder, to_path
+from uavmec_jax.files.locations import names_in, reached, remove_folder
 from uavmec_jax.files.locks import describe_process, owner_of
 from uavmec_jax.files.writing import set_aside
 from uavmec_jax.runs.folder import RUN_PLAN, SHARDS, TOUR, RunFolder
@@ -19,11 +19,12 @@ def check_directory(directory: Path) -> None:
     """Refuse a folder that cannot take a run or a tour.
 
     Raises:
-        StudyError: it is not empty, another process works in it, or it is a file.
+        StudyError: it is not empty, another process works in it, it is a file, or its object store cannot be reached.
     """
-    if (owner := owner_of(directory / SHARDS)) is not None:
-        raise StudyError(f"{directory}: {describe_process(owner)} is working in it")
-    check_empty(directory)
+    with reached(directory):
+        if (owner := owner_of(directory / SHARDS)) is not None:
+            raise StudyError(f"{directory}: {describe_process(owner)} is working in it")
+        check_empty(directory)
 
 
 def check_empty(directory: Path) -> None:
@@ -38,7 +39,7 @@ def check_empty(directory: Path) -> None:
         )
     if (directory / TOUR).exists():
         raise StudyError(f"{directory}: already holds a tour of `uavmec plan`; give another folder with --out")
-    if directory.exists() and not (directory.is_dir() and all(file.name == SHARDS for file in directory.iterdir())):
+    if directory.exists() and not (directory.is_dir() and set(names_in(directory)) <= {SHARDS}):
         raise StudyError(f"{directory}: exists and is not an empty folder; give another one with --out")
 
 
@@ -98,16 +99,17 @@ def partial_results(folder: RunFolder) -> Results:
 
 
 def load_results(directory: str | Path) -> Results:
-    """Load the results of a run, all but its weights (see :func:`load_weights`).
+    """Load the results of a run, all but its weights (see :func:`load_weights`), from a folder or a URL.
 
     Of an unfinished run, the results are those of its finished shards.
 
     Raises:
-        StudyError: the folder holds no run, a file is damaged, or another version wrote it.
+        StudyError: the folder holds no run, a file is damaged, another version wrote it, or its object store cannot be
+            reached.
     """
-    directory = to_path(directory)
-    if not (directory / RUN).exists() and (directory / RUN_PLAN).exists():
-        return partial_results(RunFolder.open(directory))
-    if not (directory / RUN).exists() and (directory / TOUR).exists():
-        raise StudyError(f"{directory}: holds no run; it holds a tour of `uavmec plan` ({TOUR})")
-    return read_results(directory)
+    with reached(directory) as path:
+        if not (path / RUN).exists() and (path / RUN_PLAN).exists():
+            return partial_results(RunFolder.open(path))
+        if not (path / RUN).exists() and (path / TOUR).exists():
+            raise StudyError(f"{path}: holds no run; it holds a tour of `uavmec plan` ({TOUR})")
+        return read_results(path)

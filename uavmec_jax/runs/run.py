@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 from uavmec_jax.cluster.connection import Cluster, connected
 from uavmec_jax.cluster.options import RayOptions
 from uavmec_jax.errors import StudyError
-from uavmec_jax.files.locations import remove_folder, to_path
+from uavmec_jax.files.locations import is_local, reached, remove_folder, to_path
 from uavmec_jax.files.locks import lock_folder
 from uavmec_jax.runs.folder import LOG, RUN_PLAN, SHARDS, RunFolder
 from uavmec_jax.runs.in_process import OnProgress, run_here
@@ -71,7 +72,8 @@ def run_study(
     Raises:
         StudyError: the population does not fit in memory, the directory cannot take a run or another process works in it,
             shards failed, ``reward`` is given beside an axis of rewards, a package is not installed, Ray cannot be reached,
-            or is given without a directory or with a reward function.
+            or is given without a directory or with a reward function; the directory is a URL, and its object store cannot
+            be reached or written to.
     """
     if reward is not None and "reward" in study.axes:
         raise StudyError(f"{study.name}: axes.reward is given, and a reward function too; leave one of them out")
@@ -79,12 +81,13 @@ def run_study(
     if ray and (directory is None or reward is not None):
         raise StudyError(f"{study.name}: a run on Ray needs a directory and no reward function")
     path = None if directory is None else to_path(directory)
-    if path is not None:
-        check_directory(path)
     options = options or RunOptions()
+    if path is not None:
+        _check_location(path, ray, tensorboard=options.tensorboard)
+        check_directory(path)
     if options.tensorboard:
         tensorboard_writer()
-    with connected(ray) as cluster:
+    with nullcontext() if path is None else reached(path), connected(ray) as cluster:
         machine = probe_node(cluster) if cluster else None
         plan = plan_run(study, shard_size=shard_size, machine=machine)
         on_plan(plan)
@@ -124,24 +127,26 @@ def resume_run(
         on_event: called with ``(event, facts)`` of everything that is logged.
 
     Raises:
-        StudyError: the directory holds no run, the run plan is damaged, another process works in it, or the run needs
-            its reward function or was planned with other code.
+        StudyError: the directory holds no run, the run plan is damaged, another process works in it, its object store
+            cannot be reached, or the run needs its reward function or was planned with other code.
     """
-    path, ray = to_path(directory), RayOptions.of(ray)
-    folder = RunFolder.open(path)
-    folder.check_reward(reward)
-    if folder.complete:
-        remove_folder(folder.shards_folder)
-        return load_results(path)
-    if ray and reward is not None:
-        raise StudyError(f"{path}: a run on Ray takes no reward function")
-    if not other_code:
-        folder.check_code()
-    with lock_folder(folder.shards_folder, path, take_over=take_over), connected(ray) as cluster:
-        for shard in folder.plan.shards:
-            folder.failure(shard).unlink(missing_ok=True)
-        label = {"other_code": differ} if (differ := folder.other_code()) else {}
-        return _run(folder, reward, cluster, on_progress, on_event, label)
+    ray = RayOptions.of(ray)
+    with reached(directory) as path:
+        folder = RunFolder.open(path)
+        folder.check_reward(reward)
+        if folder.complete:
+            remove_folder(folder.shards_folder)
+            return load_results(path)
+        if ray and reward is not None:
+            raise StudyError(f"{path}: a run on Ray takes no reward function")
+        _check_location(path, ray)
+        if not other_code:
+            folder.check_code()
+        with lock_folder(folder.shards_folder, path, take_over=take_over), connected(ray) as cluster:
+            for shard in folder.plan.shards:
+                folder.failure(shard).unlink(missing_ok=True)
+            label = {"other_code": differ} if (differ := folder.other_code()) else {}
+            return _run(folder, reward, cluster, on_progress, on_event, label)
 
 
 def run_or_resume(
@@ -153,9 +158,27 @@ def run_or_resume(
     on_progress: OnProgress = lambda _: None,
 ) -> Results:
     """Run a study in a folder; if it holds a run, resume that, or load its results if it is complete."""
-    if (to_path(directory) / RUN_PLAN).exists():
+    with reached(directory) as path:
+        started = (path / RUN_PLAN).exists()
+    if started:
         return resume_run(directory, ray=ray, on_progress=on_progress)
     return run_study(study, directory, command=command, ray=ray, on_progress=on_progress)
+
+
+def _check_location(path: Path, ray: RayOptions | None, *, tensorboard: bool = False) -> None:
+    """Refuse what cannot be done in an object store.
+
+    Raises:
+        StudyError: TensorBoard's files are wanted there, or Ray's nodes cannot see it.
+    """
+    if is_local(path):
+        return
+    if tensorboard:
+        raise StudyError(
+            f"{path}: --tensorboard writes files beside the run, which must then be in a folder, not a URL"
+        )
+    if ray and str(path).startswith("memory:"):
+        raise StudyError(f"{path}: is the memory of one process, which the nodes of Ray do not see; give another URL")
 
 
 def _run(

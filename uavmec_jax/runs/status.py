@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from uavmec_jax.files.locations import file_system, is_local, to_path
+from uavmec_jax.files.locations import file_system, is_local, path_in_store, reached
 from uavmec_jax.files.locks import describe_process, owner_of
 from uavmec_jax.runs.folder import RunFolder
 
@@ -55,9 +55,13 @@ def run_status(directory: str | Path) -> Status:
     """Return the status of the run in a folder.
 
     Raises:
-        StudyError: the folder holds no run, or the run plan is damaged.
+        StudyError: the folder holds no run, the run plan is damaged, or its object store cannot be reached.
     """
-    folder = RunFolder.open(to_path(directory))
+    with reached(directory) as path:
+        return _status_of(RunFolder.open(path))
+
+
+def _status_of(folder: RunFolder) -> Status:
     plan = folder.plan
     counts: Counter[str] = Counter(waiting=0, running=0, stopped=0, failed=0, done=0)
     nodes: Counter[str] = Counter()
@@ -79,7 +83,7 @@ def run_status(directory: str | Path) -> Status:
             running.append(f"shard {shard.number}: process {report.get('pid', '?')} on {node}")
     owner = owner_of(folder.shards_folder)
     return Status(
-        directory=str(directory),
+        directory=str(folder.path),
         complete=folder.complete,
         owner=describe_process(owner) if owner else "",
         agents=plan.agents,
@@ -99,7 +103,7 @@ def run_status(directory: str | Path) -> Status:
 def _size_of(folder: Path) -> int:
     """Return the size of all files in a folder."""
     if not is_local(folder):
-        return int(file_system(folder).du(folder.path))  # type: ignore[attr-defined]
+        return int(file_system(folder).du(path_in_store(folder)))
     return sum(_size(file) for file in folder.rglob("*") if file.is_file())
 
 

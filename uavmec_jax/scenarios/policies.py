@@ -18,6 +18,7 @@ from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Policy
 from uavmec_jax.errors import PolicyError
+from uavmec_jax.files.locations import reached
 from uavmec_jax.files.validation import suggest
 from uavmec_jax.planning.fleet_demand import is_alone
 from uavmec_jax.planning.fleet_rules import for_fleets
@@ -169,15 +170,22 @@ class TrainedPolicy:
         return out_of_distribution(drawn["scenarios"], drawn["params"], params, layout) if drawn else []
 
     def save(self, path: str | Path) -> None:
-        """Write the policy to a file of its own (``.npz``), atomically."""
-        write_policies(Path(path), self.collection)
+        """Write the policy to a file of its own (``.npz``), atomically.
+
+        Raises:
+            OSError: the file cannot be written.
+            PolicyError: the path is a URL, and its object store cannot be reached or written to.
+        """
+        with reached(path, PolicyError) as file:
+            write_policies(file, self.collection)
 
 
 def load_policy(source: str | Path, which: str = "best", **axes: Any) -> Policy:
     """Load a policy by name, from a file, or of one agent of a run.
 
     Args:
-        source: ``"generalist"``, a name in :data:`FLEET_HEURISTICS`, ``"rollout"``, a policy file, or the folder of a run.
+        source: ``"generalist"``, a name in :data:`FLEET_HEURISTICS`, ``"rollout"``, a policy file, or the folder of a run;
+            file and folder may be URLs, such as ``s3://bucket/run``.
         which: ``"best"`` or ``"last"`` weights of a run's agent; a policy file has only one of the two.
         axes: values that select one agent of a run, e.g. ``powered=8, connected=8, seed=3, algorithm="ppo"``; axes on
             which all agents have the same value may be left out.
@@ -187,20 +195,21 @@ def load_policy(source: str | Path, which: str = "best", **axes: Any) -> Policy:
 
     Raises:
         PolicyError: there is no such policy; its file is damaged, altered or from another version; its weights are not
-            finite; or no agent, or more than one, has the given values.
+            finite; no agent, or more than one, has the given values; or an object store cannot be reached.
     """
     if str(source) in FLEET_HEURISTICS:
         return FLEET_HEURISTICS[str(source)]
     if str(source) == "rollout":
         return rollout_planner()
     shipped = {Path(file.name).stem: file for file in _SHIPPED.iterdir() if file.name.endswith(".npz")}
-    path = Path(str(shipped.get(str(source), source)))
-    if path.is_dir():
-        path = path / WEIGHTS
-    elif not path.exists() and not path.suffix:
-        hint = suggest(str(source), [*shipped, *FLEET_HEURISTICS, "rollout"])
-        raise PolicyError(f"{source}: neither a file nor a policy by name; {hint}")
-    collection = read_policies(path)
+    location = Path(str(shipped[str(source)])) if str(source) in shipped else source
+    with reached(location, PolicyError) as path:
+        if path.is_dir():
+            path = path / WEIGHTS
+        elif not path.exists() and not path.suffix:
+            hint = suggest(str(source), [*shipped, *FLEET_HEURISTICS, "rollout"])
+            raise PolicyError(f"{source}: neither a file nor a policy by name; {hint}")
+        collection = read_policies(path)
     kinds = {key.split("/")[1] for key in collection.weights}
     if len(kinds) == 1:
         (which,) = kinds

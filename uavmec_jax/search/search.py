@@ -14,6 +14,7 @@ from uavmec_jax.cluster.connection import connected
 from uavmec_jax.cluster.options import RayOptions
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files.extras import optional
+from uavmec_jax.files.locations import local_path
 from uavmec_jax.files.writing import write_text
 from uavmec_jax.search.halving import SuccessiveHalving, TrialOutcome
 from uavmec_jax.search.space import (
@@ -101,7 +102,7 @@ def run_search(
 
     Args:
         space: from :func:`uavmec_jax.search.space.load_space`.
-        directory: folder of the search: its database, table and best settings.
+        directory: folder of the search, on this machine: its database, table and best settings.
         command: the command line, for the label.
         ray: train the batches on Ray: ``True`` for the cluster of ``RAY_ADDRESS``, else one on this machine; an address;
             or options. All nodes must have the same version of this package.
@@ -112,7 +113,7 @@ def run_search(
             fit in memory; on Ray, also if it is not installed or cannot be reached, a node has other code, or a shard failed.
     """
     optuna = _import_optuna()
-    path = Path(directory)
+    path = local_path(directory, "the database of a search")
     _check_directory(path, space)
     path.mkdir(parents=True, exist_ok=True)
     write_text(path / FACTS, json.dumps({"space": space.model_dump(mode="json"), "command": command} | host.describe()))

@@ -13,6 +13,7 @@ import pandas as pd
 from flax import traverse_util
 from jaxtyping import Float
 
+from uavmec_jax.files.locations import make_folder, reached
 from uavmec_jax.files.writing import write_arrays, write_text
 from uavmec_jax.scenarios.policy_files import WEIGHTS, PolicyCollection, write_policies
 from uavmec_jax.scenarios.settings import unused_params
@@ -223,9 +224,18 @@ class Results:
         episodes = self.evaluation[f"{policy}/first_failure"]
         return np.asarray((episodes if policy in PLANNERS else episodes[:, :-1]).mean(axis=1))
 
-    def save(self, directory: Path) -> None:
-        """Write all files into a folder, each atomically; ``run.json``, with the SHA-256 of the others, comes last."""
-        directory.mkdir(parents=True, exist_ok=True)
+    def save(self, directory: str | Path) -> None:
+        """Write all files into a folder, each atomically; ``run.json``, with the SHA-256 of the others, comes last.
+
+        Raises:
+            OSError: a file cannot be written.
+            StudyError: the folder is a URL, and its object store cannot be reached or written to.
+        """
+        with reached(directory) as path:
+            self._save(path)
+
+    def _save(self, directory: Path) -> None:
+        make_folder(directory)
         write_text(directory / STUDY, study_toml(self.study))
         if len(self.agents):
             write_text(directory / AGENTS, self.agents.to_csv(index=False, float_format="%.6g"))

@@ -1,6 +1,7 @@
 """Read results back from the files of a finished run."""
 
 import hashlib
+import io
 import json
 from pathlib import Path
 from typing import Any
@@ -8,12 +9,13 @@ from typing import Any
 import pandas as pd
 from flax import traverse_util
 
-from uavmec_jax.errors import StudyError
+from uavmec_jax.errors import PolicyError, StudyError
 from uavmec_jax.files.archives import load_arrays
+from uavmec_jax.files.locations import reached
 from uavmec_jax.files.reading import read_text
 from uavmec_jax.scenarios.policy_files import WEIGHTS, read_policies
 from uavmec_jax.studies.results import AGENTS, CURVES, EVALUATION, RUN, SCHEMA, STUDY, Results
-from uavmec_jax.studies.study import load_study
+from uavmec_jax.studies.study import parse_study
 
 _MAY_BE_MISSING = ("_planned", "_first_device", "_first_share", "_service", "_censored")
 """Ends of the names of columns of numbers that not every agent has."""
@@ -31,7 +33,7 @@ def read_results(directory: Path) -> Results:
         agents = _read_table(directory / AGENTS)
     except (OSError, ValueError) as error:
         raise StudyError(f"{directory}: cannot be read: {error}") from None
-    study = load_study(directory / STUDY)
+    study = parse_study(read_text(directory / STUDY, StudyError), str(directory / STUDY))
     curves = traverse_util.unflatten_dict(load_arrays(directory / CURVES), sep="/") if study.algorithms else {}
     return Results(study=study, run=run, agents=agents, curves=curves, evaluation=load_arrays(directory / EVALUATION))
 
@@ -39,7 +41,7 @@ def read_results(directory: Path) -> Results:
 def _read_run(directory: Path) -> dict[str, Any]:
     """Read ``run.json``."""
     path = directory / RUN
-    if not path.is_file():
+    if not path.exists():
         raise StudyError(f"{directory}: holds no run ({RUN} is missing)")
     try:
         run: dict[str, Any] = json.loads(read_text(path, StudyError))
@@ -55,7 +57,7 @@ def _check_digests(directory: Path, run: dict[str, Any]) -> None:
     """Check that the files are as the run wrote them."""
     for name, digest in run.get("sha256", {}).items():
         path = directory / name
-        if path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() != digest:
+        if path.exists() and hashlib.sha256(path.read_bytes()).hexdigest() != digest:
             raise StudyError(f"{path}: cannot be read: was altered or damaged since the run wrote it")
 
 
@@ -64,21 +66,23 @@ def _read_table(path: Path) -> pd.DataFrame:
 
     Numbers are missing (NaN) for agents for which a planner was not evaluated.
     """
-    columns = pd.read_csv(path, nrows=0).columns
+    content = path.read_bytes()
+    columns = pd.read_csv(io.BytesIO(content), nrows=0).columns
     lists = {name: str for name in columns if name.endswith("_devices_fixed")}
     missing = {name: [""] for name in columns if name.endswith(_MAY_BE_MISSING)}
-    return pd.read_csv(path, dtype=lists, keep_default_na=False, na_values=missing)
+    return pd.read_csv(io.BytesIO(content), dtype=lists, keep_default_na=False, na_values=missing)
 
 
 def load_weights(directory: str | Path, which: str = "best", algorithm: str | None = None) -> dict[str, Any]:
     """Load trained weights of a run as the networks take them, leaves ``[A, ...]`` in the order of ``agents.csv``.
 
     Args:
-        directory: folder of the run.
+        directory: folder of the run, a path or a URL.
         which: ``"best"`` or ``"last"``.
         algorithm: name of the algorithm; by default the first one of the run.
 
     Raises:
-        PolicyError: there are no such weights, or the file is damaged.
+        PolicyError: there are no such weights, the file is damaged, or its object store cannot be reached.
     """
-    return read_policies(Path(directory) / WEIGHTS).weights_of(which, algorithm)
+    with reached(directory, PolicyError) as path:
+        return read_policies(path / WEIGHTS).weights_of(which, algorithm)
