@@ -3,7 +3,7 @@
     uv run python experiments/ray_scale.py [--shards 10000] [--out results/ray]
 
 1. A driver with 10,000 shards on four nodes. In place of training, each shard writes an empty result: what remains is
-   scheduling, the driver's own work and the files. Also measured: the driver's memory, and the time that `uavmec status` takes.
+   scheduling, the driver's work and the files. Also measured: its memory, and the time that `uavmec status` takes.
 2. A real study in eight shards on one, two and four nodes, each pinned to one core, beside what `--simulate` says for the
    speed of one process on one core. With fewer cores than nodes, nodes share them.
 

@@ -9,6 +9,7 @@ from . import traffic as traffic
 from . import training as training
 from ._version import __version__ as __version__
 from .agents.presets import DQN_BEST as DQN_BEST
+from .cluster.options import RayOptions as RayOptions
 from .env.dynamics import Cause as Cause
 from .env.dynamics import Outcome as Outcome
 from .env.dynamics import State as State
