@@ -34,7 +34,15 @@ def test_shipped_studies_are_valid_and_round_trip(name):
     study = load_study(name)
     assert study.name == name
     assert parse_study(study_toml(study), "again") == study
-    sizes = {"fleet": 7500, "planning": 2500, "table6": 675, "table7": 240, "table7-ppo": 120, "generalist": 2, "generalist-pqn": 2}
+    sizes = {
+        "fleet": 7500,
+        "planning": 2500,
+        "table6": 675,
+        "table7": 240,
+        "table7-ppo": 120,
+        "generalist": 2,
+        "generalist-pqn": 2,
+    }
     assert n_agents(study) == len(make_agent_ids(study)) == sizes.get(name, 250)
 
 
