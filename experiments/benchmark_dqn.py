@@ -4,8 +4,8 @@
 
 Both run the same algorithm (batches of 16, one gradient step per four environment steps), with replay buffers that hold
 100,000 transitions per agent before the clock starts. Without the `sb3` group the comparison is left out. With
-``--setting tuned`` this package's DQN has batches of 64, 10-step returns, and a double and dueling network; the library and
-the ceiling stay as they are. Prints a table and writes ``benchmark_dqn.json``.
+``--setting tuned`` both have batches of 64 and 10-step returns, and this package's DQN a double and dueling network besides,
+which the library has not; the ceiling stays as it is. Prints a table and writes ``benchmark_dqn.json``.
 """
 
 import argparse
@@ -106,7 +106,7 @@ def ceiling(agents_per_device: int, seconds: float) -> float:
     return float(np.median(rates))
 
 
-def sb3_worker(seconds: float) -> None:
+def sb3_worker(seconds: float, setting: str) -> None:
     """Measure the environment steps/s of one Stable-Baselines3 process, and print them as JSON."""
     os.environ["JAX_PLATFORMS"] = "cpu"
     import numpy as np
@@ -116,8 +116,9 @@ def sb3_worker(seconds: float) -> None:
     from uavmec_jax.interop.gymnasium_env import UavMecGymEnv
 
     torch.set_num_threads(1)  # faster than several for networks this small
+    nearest = {"batch_size": 64, "n_steps": 10} if setting == "tuned" else {"batch_size": 16}
     model = DQN(
-        "MlpPolicy", UavMecGymEnv(), learning_rate=0.0071, batch_size=16, gamma=0.98,
+        "MlpPolicy", UavMecGymEnv(), learning_rate=0.0071, gamma=0.98, **nearest,
         buffer_size=2 * FILLED, exploration_fraction=0.35, policy_kwargs={"net_arch": [64, 64]}, device="cpu", seed=0,
     )  # fmt: skip
     model.learn(2000)
@@ -140,9 +141,9 @@ def sb3_worker(seconds: float) -> None:
     print(json.dumps({"steps_per_second": steps / spent, "environment_share": share}))
 
 
-def sb3_speed(processes: int, seconds: float) -> tuple[float, float]:
+def sb3_speed(processes: int, seconds: float, setting: str) -> tuple[float, float]:
     """Measure Stable-Baselines3 processes: environment steps/s of all together, and the environment's share of the time."""
-    command = [sys.executable, __file__, "--sb3-worker", "--seconds", str(seconds)]
+    command = [sys.executable, __file__, "--sb3-worker", "--seconds", str(seconds), "--setting", setting]
     running = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(processes)]
     outputs = [process.communicate()[0] for process in running]
     rows = [json.loads(output.splitlines()[-1]) for output in outputs]
@@ -153,12 +154,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=10.0, help="length of each measurement")
     parser.add_argument("--agents", type=int, nargs="+", default=POPULATIONS, help="sizes of the populations")
-    parser.add_argument("--setting", choices=SETTINGS, default="paper", help="settings of this package's DQN")
+    parser.add_argument("--setting", choices=SETTINGS, default="paper", help="settings of the DQN")
     parser.add_argument("--out", type=Path, help="folder for benchmark_dqn.json")
     parser.add_argument("--sb3-worker", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.sb3_worker:
-        sb3_worker(arguments.seconds)
+        sb3_worker(arguments.seconds, arguments.setting)
         return
     from uavmec_jax.training import host
 
@@ -176,11 +177,11 @@ def main() -> None:
     report["setting"] = arguments.setting
     has_sb3 = find_spec("stable_baselines3") is not None
     missing = (float("nan"), float("nan"))
-    sb3_alone, share = sb3_speed(1, arguments.seconds) if has_sb3 else missing
+    sb3_alone, share = sb3_speed(1, arguments.seconds, arguments.setting) if has_sb3 else missing
     report |= {"sb3_one_process": sb3_alone, "sb3_environment_share": share}
     cores = facts["cores"]
     report["sb3_processes"] = cores
-    report["sb3_all_processes"], _ = sb3_speed(cores, arguments.seconds) if has_sb3 else missing
+    report["sb3_all_processes"], _ = sb3_speed(cores, arguments.seconds, arguments.setting) if has_sb3 else missing
     report["training"] = [train_speed(n, arguments.seconds, setting=arguments.setting) for n in arguments.agents]
     report["ceiling"] = ceiling(AGENTS_PER_CORE - 2, arguments.seconds)
     report["environment"] = {n: environment_speed(n, arguments.seconds) for n in (75, 4096)}

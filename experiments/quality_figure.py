@@ -28,7 +28,7 @@ def quality_figure(table: pd.DataFrame, path: Path) -> None:
     left.set_xscale("log")
     left.set_xlabel("seconds of the machine per agent")
     right.set_xlabel("environment steps of an agent")
-    left.set_ylabel("lifetime of the present weights, % of the upper bound")
+    left.set_ylabel("last weights, % of the upper bound")
     for axis in (left, right):
         axis.set_ylim(60, 100.5)
         axis.grid(alpha=0.3)

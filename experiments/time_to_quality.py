@@ -4,9 +4,10 @@
 
 One agent on each of 250 layouts, ten in each of the 25 cells. At every look the present weights play 20 held-out draws, whose
 upper bound is known; the looks do not count as time. The time of an agent is the wall time of the population divided by its
-agents. Stable-Baselines3 trains with the nearest setting that it has (no double, no dueling network) on five of the layouts,
+agents. Stable-Baselines3 trains with the nearest setting that it has (see `sb3_quality.py`) on five of the layouts,
 one agent per process and core; its time is that of all agents on all cores divided by the agents. Without the group `sb3` it
-is left out. Writes `time_to_quality.json`, `.csv` and `.png`.
+is left out. Writes `time_to_quality.json`, `.csv` and `.png`; with `--learners` or `--no-sb3`, the other learners keep their
+rows of an earlier table in the same folder.
 """
 
 import argparse
@@ -94,6 +95,14 @@ def time_to(curve: pd.DataFrame, share: float, column: str = "share") -> float:
     return float(curve["seconds"].iloc[first]) if first < len(curve) else float("nan")
 
 
+def with_earlier(curves: list[pd.DataFrame], path: Path) -> list[pd.DataFrame]:
+    """Return the curves and those of an earlier table whose learners are not among them, in the order of that table."""
+    if not path.exists():
+        return curves
+    earlier = {str(name): curve for name, curve in pd.read_csv(path).groupby("learner", sort=False)}
+    return list((earlier | {str(curve["learner"].iloc[0]): curve for curve in curves}).values())
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=10, help="layouts in each of the 25 cells")
@@ -111,6 +120,7 @@ def main() -> None:
         curves.append(measure(name, arguments.seeds, arguments.every, arguments.steps))
         share, seconds = curves[-1][["share", "seconds"]].iloc[-1]
         print(f"{name}: {share:.2%} of the bound, {seconds:.2f} s", flush=True)
+    curves = with_earlier(curves, arguments.out / "time_to_quality.csv")
     report: dict[str, Any] = {"command": "python experiments/time_to_quality.py", **host.describe(), "learners": {}}
     for curve in curves:
         times = {f"{share:.2f}": time_to(curve, share) for share in SHARES}

@@ -1,4 +1,4 @@
-"""Settings for those who want the best learner and not to choose: keywords for :func:`uavmec_jax.train`."""
+"""Presets for users who want the best learner without choosing settings: keywords for :func:`uavmec_jax.train`."""
 
 from collections.abc import Mapping
 from types import MappingProxyType

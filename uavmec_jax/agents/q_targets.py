@@ -22,7 +22,7 @@ def lambda_returns(
     gamma: Scalar,
     q_lambda: Scalar,
 ) -> Float[Array, "t e"]:
-    """Return the lambda-returns of Q-learning (Watkins, 1989; Gallici et al., 2025, section 4.3).
+    """Return the lambda-returns of Q-learning: cut (Watkins, 1989) or not (Peng and Williams, 1996; Gallici et al., 2025).
 
     Args:
         reward: reward of each slot.
