@@ -25,7 +25,7 @@ import pandas as pd
 import psutil
 from reports import write_report
 
-from uavmec_jax.cluster.connection import _prepare_environment
+from uavmec_jax.cluster.connection import prepare_environment
 from uavmec_jax.cluster.options import LOCAL
 
 STUDY = """
@@ -299,7 +299,7 @@ def main() -> None:
     parser.add_argument("--faults", type=int, help="of each kind, for a test of the script")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    _prepare_environment(LOCAL)
+    prepare_environment(LOCAL)
     work = arguments.work.absolute()
     work.mkdir(parents=True)
     (work / "faults.toml").write_text(STUDY)

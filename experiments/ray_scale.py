@@ -23,7 +23,7 @@ from typing import Any
 import psutil
 from reports import write_report
 
-from uavmec_jax.cluster.connection import _prepare_environment, connect
+from uavmec_jax.cluster.connection import connect, prepare_environment
 from uavmec_jax.cluster.options import LOCAL, RayOptions
 
 SETTINGS = ["axes.seeds=4", "steps=400000", "evaluation.planners=[]", "axes.powered=[12,4]", "axes.connected=[8,4]"]
@@ -39,7 +39,7 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=Path("runs/ray-scale"))
     parser.add_argument("--out", type=Path, default=Path("results/ray"))
     arguments = parser.parse_args()
-    _prepare_environment(LOCAL)
+    prepare_environment(LOCAL)
     work = arguments.work.absolute()
     work.mkdir(parents=True)
     settings = [*SETTINGS, *([f"steps={arguments.steps}"] if arguments.steps else [])]

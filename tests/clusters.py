@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from uavmec_jax.cluster.connection import _prepare_environment
+from uavmec_jax.cluster.connection import prepare_environment
 from uavmec_jax.cluster.options import LOCAL
 
 FORK = "ignore:os.fork"
@@ -16,7 +16,7 @@ CPUS = 2
 @contextmanager
 def simulated_cluster(nodes: int, **resources) -> Iterator:
     """Start a cluster of so many nodes and a head that takes no work; yield Ray's own object for such clusters."""
-    _prepare_environment(LOCAL)
+    prepare_environment(LOCAL)
     import ray
     from ray.cluster_utils import Cluster
 

@@ -54,7 +54,7 @@ def test_simulate():
     [
         (["resume", "."], "uavmec: .: holds no run that can be resumed (run_plan.json is missing)"),
         (["status", "nowhere"], "uavmec: nowhere: holds no run that can be resumed"),
-        (["run", "table5", "--ray", "table6"], "uavmec: --ray table6: is no address of a Ray cluster; give host:port,"),
+        (["run", "table5", "--ray", "table6"], "uavmec: --ray table6: is not the address of a Ray cluster; give"),
         (["resume", ".", "--retries", "3"], "uavmec: --cpus-per-shard, --gpus-per-shard, --resource, --retries and"),
         (
             ["run", "table5", "--resource", "fast=no", "--ray"],

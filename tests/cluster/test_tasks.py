@@ -97,7 +97,7 @@ def test_a_process_that_dies_is_replaced(cluster, tmp_path):
 
 
 def test_a_process_that_dies_again_and_again_without_getting_further_is_given_up(cluster, tmp_path, monkeypatch):
-    monkeypatch.setattr("uavmec_jax.cluster.tasks._CRASHES", 2)
+    monkeypatch.setattr("uavmec_jax.cluster.tasks._MAX_CRASHES", 3)
     (failed,) = run(cluster, Task("a", die, lambda: (tmp_path / "stuck", 99))).values()
     assert failed.error.startswith("its process died 3 times in a row")
     position = iter(range(100)).__next__  # it gets further every time

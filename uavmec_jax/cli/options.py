@@ -198,14 +198,14 @@ def ray_options(command: Callable) -> Callable:
             "--retries",
             type=click.IntRange(0),
             default=default.retries,
-            help="With --ray: how often a shard is tried again after an error of the program; nodes that die do not "
-            f"count (default: {default.retries}).",
+            help="With --ray: how often a shard is retried after an application error; nodes that die do not count "
+            f" (default: {default.retries}).",
         ),
         click.option(
             "--time-limit",
             "time_limit_s",
             type=click.FloatRange(1),
-            help="With --ray: seconds after which an attempt at a shard is ended and made anew from its checkpoint.",
+            help="With --ray: kill an attempt at a shard after this many seconds and retry it from its last checkpoint.",
         ),
     )
 

@@ -21,8 +21,9 @@ _EVENTS = {
     "damaged": "shard {shard}: {error}; the file is renamed and not used",
     "restored": "shard {shard} resumes from {file}, step {steps:,}",
     "failed": "shard {shard} failed: {error}",
-    "lost": "shard {shard}: its process or node is lost ({error}); it is tried again",
-    "retried": "shard {shard}: {error}; it is tried again",
+    "lost": "shard {shard}: worker or node lost ({error}); retrying",
+    "retried": "shard {shard}: {error}; retrying",
+    "waiting": "{error}; waiting for one that can",
 }
 """Events of a run that are printed, and how."""
 
@@ -59,7 +60,7 @@ def report_results(results: Any, directory: Path, console: Any, as_json: bool) -
 @click.option(
     "--take-over",
     is_flag=True,
-    help="Resume although the folder names a process on another machine as its owner, which is dead.",
+    help="Take the run over from an owner on another machine that you know to be dead.",
 )
 @click.option(
     "--other-code", is_flag=True, help="Resume although code or libraries have changed; the results may differ."

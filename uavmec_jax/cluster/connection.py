@@ -41,10 +41,12 @@ class Cluster:
     Attributes:
         ray: the module ``ray``.
         options: what each shard needs.
+        head: address of the head's store, which Ray needs for everything; empty where Ray does not tell it.
     """
 
     ray: Any
     options: RayOptions
+    head: str = ""
 
     @property
     def requirements(self) -> dict[str, Any]:
@@ -56,15 +58,33 @@ class Cluster:
         """Return the nodes that are alive, as Ray describes them."""
         return [node for node in self.ray.nodes() if node["Alive"]]
 
+    @property
+    def _needed(self) -> dict[str, float]:
+        needed = {"CPU": cpus_per_shard(self.options), "GPU": self.options.gpus_per_shard, **self.options.resources}
+        return {name: amount for name, amount in needed.items() if amount}
+
     def slots(self) -> int:
         """Return how many shards the present nodes can take at the same time."""
-        needed = {"CPU": cpus_per_shard(self.options), "GPU": self.options.gpus_per_shard} | dict(
-            self.options.resources
-        )
         return sum(
-            int(min(node["Resources"].get(name, 0.0) // amount for name, amount in needed.items() if amount))
+            int(min(node["Resources"].get(name, 0.0) // amount for name, amount in self._needed.items()))
             for node in self.nodes()
         )
+
+    def shortage(self) -> str:
+        """Return what a shard needs and the nodes have, in words."""
+        most = {name: max((n["Resources"].get(name, 0.0) for n in self.nodes()), default=0.0) for name in self._needed}
+        return ", ".join(f"{name} {amount:g} (largest node: {most[name]:g})" for name, amount in self._needed.items())
+
+    def answers(self) -> bool:
+        """Return whether the head of the cluster can be reached."""
+        if not self.head:
+            return True
+        host, _, port = self.head.rpartition(":")
+        try:
+            socket.create_connection((host.strip("[]"), int(port)), timeout=_ANSWER_S).close()
+        except OSError:
+            return False
+        return True
 
 
 def cpus_per_shard(options: RayOptions) -> int:
@@ -95,20 +115,24 @@ def connect(options: RayOptions) -> Iterator[Cluster]:
     address = options.address or os.environ.get("RAY_ADDRESS") or LOCAL
     if not _ADDRESS.fullmatch(address):
         raise StudyError(
-            f"--ray {address}: is no address of a Ray cluster; give host:port, ray://host:port, auto or local"
+            f"--ray {address}: is not the address of a Ray cluster; give host:port, ray://host:port, auto or local"
         )
     if (running := _running_ray()) is not None:
-        yield Cluster(running, options)
+        cluster = Cluster(running, options, _head(running))
+        if ":" in address and "://" not in address and address != cluster.head:
+            raise StudyError(
+                f"--ray {address}: Ray already runs in this process, at {cluster.head}; leave out the address"
+            )
+        yield cluster
         return
-    _prepare_environment(address)
+    prepare_environment(address)
     ray = optional("ray", "--ray", "ray")
     with local_cluster(n_cores()) if address == LOCAL else nullcontext(address) as joined:
         _init(ray, joined)
         try:
-            cluster = Cluster(ray, options)
+            cluster = Cluster(ray, options, _head(ray))
             if address == LOCAL and not cluster.slots():
-                needed = ", ".join(f"{name} {amount}" for name, amount in cluster.requirements.items() if amount)
-                raise StudyError(f"--ray local: this machine cannot take a shard, which needs {needed}; ask for less")
+                raise StudyError(f"--ray local: this machine cannot take a shard, which needs {cluster.shortage()}")
             yield cluster
         finally:
             ray.shutdown()
@@ -135,11 +159,23 @@ def _init(ray: Any, address: str) -> None:
         StudyError: nobody answers at the address.
     """
     if ":" in address and not _answers(address):
-        raise StudyError(f"--ray {address}: no cluster answers there")
+        raise StudyError(f"--ray {address}: cannot reach a Ray cluster at this address")
     try:
         ray.init(address, log_to_driver=False, logging_level="error")
     except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
-        raise StudyError(f"--ray {address}: no cluster answers there: {first_line(error)}") from None
+        if "No node info found" in str(error):
+            raise StudyError(
+                f"--ray {address}: this machine is not a node of that cluster; run the command on a node, or give ray://HOST:10001"
+            ) from None
+        raise StudyError(f"--ray {address}: cannot reach a Ray cluster at this address: {first_line(error)}") from None
+
+
+def _head(ray: Any) -> str:
+    """Return the address of the head's store; empty for a Ray client, whose connection is its own."""
+    try:
+        return str(ray.get_runtime_context().gcs_address)
+    except (AttributeError, RuntimeError, ray.exceptions.RayError):
+        return ""
 
 
 def _answers(address: str) -> bool:
@@ -147,7 +183,8 @@ def _answers(address: str) -> bool:
     host, _, port = address.removeprefix("ray://").rpartition(":")
     hosts = [host.strip("[]")]
     if hosts[0] in ("localhost", "127.0.0.1", "::1"):  # for Ray, that is any address of this machine
-        hosts += [one.address for addresses in psutil.net_if_addrs().values() for one in addresses]
+        families = (socket.AF_INET, socket.AF_INET6)
+        hosts += [one.address for some in psutil.net_if_addrs().values() for one in some if one.family in families]
     for candidate in hosts:
         try:
             socket.create_connection((candidate, int(port)), timeout=_ANSWER_S).close()
@@ -169,7 +206,7 @@ def _running_ray() -> Any:
     return ray if ray is not None and ray.is_initialized() else None
 
 
-def _prepare_environment(address: str) -> None:
+def prepare_environment(address: str) -> None:
     """Set what Ray reads when it is imported: a token and the loopback interface for a cluster that is started here.
 
     Raises:
@@ -178,13 +215,13 @@ def _prepare_environment(address: str) -> None:
     """
     for name, value in _QUIET.items():
         os.environ.setdefault(name, value)
-    if address == LOCAL and os.environ.get(_ON_NETWORK) != "0":
-        if "ray" in sys.modules:
+    if address == LOCAL:
+        wanted = {_ON_NETWORK: "0", "RAY_AUTH_MODE": os.environ.get("RAY_AUTH_MODE", "token")}
+        if wanted["RAY_AUTH_MODE"] == "token" and not _has_token():
+            wanted["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
+        if "ray" in sys.modules and any(os.environ.get(name) != value for name, value in wanted.items()):
             raise StudyError("--ray local: Ray was imported before; start it with ray.init() first, or give an address")
-        os.environ[_ON_NETWORK] = "0"
-        os.environ.setdefault("RAY_AUTH_MODE", "token")
-        if os.environ["RAY_AUTH_MODE"] == "token" and not _has_token():
-            os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
+        os.environ |= wanted
     if os.environ.get("RAY_AUTH_MODE") == "token" and not _has_token():
         raise StudyError(
             "RAY_AUTH_MODE is token and there is no token: set RAY_AUTH_TOKEN, or RAY_AUTH_TOKEN_PATH to a file with it, "

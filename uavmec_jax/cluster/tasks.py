@@ -1,5 +1,6 @@
-"""Tasks on a cluster that outlive its nodes: what is lost is submitted again, what is wrong a few times only."""
+"""Fault-tolerant tasks on Ray: resubmitted without limit after node failures, a limited number of times after errors."""
 
+import re
 import time
 import traceback
 from collections import deque
@@ -10,16 +11,25 @@ from typing import Any
 from uavmec_jax.cluster.connection import Cluster, first_line
 from uavmec_jax.errors import StudyError, UserError
 
-_IN_FLIGHT = 1000
+_MAX_IN_FLIGHT = 1000
 """Tasks that are submitted at the same time: enough for any cluster to see what is waiting."""
 
 _WAIT_S = 0.2
 """Seconds of one look for finished tasks."""
 
-_CRASHES = 10
+_MAX_CRASHES = 10
 """Times in a row that the process of a task may die without getting further."""
 
-_GRACE_S = 120.0
+_MAX_BACKOFF_S = 30.0
+"""Most seconds between a crash and the next attempt, which doubles from one crash to the next."""
+
+_LONELY_S = 5.0
+"""Seconds without a node that can take a task after which that is reported."""
+
+_SILENCE_S = 15.0
+"""Seconds without an answer of the head after which the connection is lost. Ray itself ends the process after a minute."""
+
+GRACE_S = 120.0
 """Seconds that cancelled tasks have to save their work."""
 
 
@@ -51,10 +61,12 @@ class TaskError:
 
 
 @dataclass
-class _Tries:
+class _Failures:
     errors: int = 0
     crashes: int = 0
     position: Any = None
+    not_before: float = 0.0
+    """Time of the monotonic clock before which the task is not submitted again."""
 
 
 @dataclass
@@ -64,12 +76,19 @@ class TaskRun:
     Attributes:
         cluster: the cluster.
         on_wait: called several times a second while tasks run.
-        on_event: called with ``(event, **facts)`` when a task is ``lost`` or ``retried``.
+        on_event: called with ``(event, **facts)`` when a task is ``lost`` or ``retried``, or ``waiting`` for a node that can
+            take it.
+        grace_s: seconds that cancelled tasks have to save their work.
     """
 
     cluster: Cluster
     on_wait: Callable[[], None] = lambda: None
     on_event: Callable[..., None] = lambda event, **facts: None
+    grace_s: float = GRACE_S
+    _answered: float = field(default_factory=time.monotonic)
+    _asked: float = field(default_factory=time.monotonic)
+    _told: bool = False
+    _lost: bool = False
     _remote: dict[Callable[..., Any], Any] = field(default_factory=dict)
 
     def results(self, tasks: Iterable[Task]) -> Generator[tuple[Any, Any], None, None]:
@@ -83,48 +102,80 @@ class TaskRun:
         """
         waiting = deque(tasks)
         running: dict[Any, Task] = {}
-        tries: dict[Any, _Tries] = {}
+        failures: dict[Any, _Failures] = {}
+        self._asked = self._answered = time.monotonic()
         try:
             while waiting or running:
-                while waiting and len(running) < _IN_FLIGHT:
-                    task = waiting.popleft()
-                    running[self._submit(task)] = task
+                self._fill(running, waiting, failures)
                 self.on_wait()
+                self._check_head()
                 for reference in self._finished(list(running)):
                     task = running.pop(reference)
-                    done, result = self._take(reference, task, tries.setdefault(task.key, _Tries()))
+                    done, result = self._resolve(reference, task, failures.setdefault(task.key, _Failures()))
                     if done:
                         yield task.key, result
                     else:
-                        waiting.appendleft(task)
+                        waiting.append(task)
         finally:
             self._cancel(list(running))
+
+    def _fill(self, running: dict[Any, Task], waiting: deque[Task], failures: dict[Any, _Failures]) -> None:
+        """Submit the tasks that wait and may be submitted."""
+        now = time.monotonic()
+        for _ in range(min(len(waiting), _MAX_IN_FLIGHT - len(running))):
+            task = waiting.popleft()
+            if task.key in failures and now < failures[task.key].not_before:
+                waiting.append(task)
+            else:
+                running[self._submit(task)] = task
 
     def _submit(self, task: Task) -> Any:
         remote = self._remote.get(task.function)
         if remote is None:  # made once: each remote function is sent to the cluster anew
-            remote = self._remote[task.function] = self.cluster.ray.remote(task.function)
-        options = {"max_retries": 0, "name": str(task.key), **self.cluster.requirements}
+            gpus = self.cluster.options.gpus_per_shard
+            # A process that has used GPUs keeps their memory, and would keep these when it is given others.
+            decorate = self.cluster.ray.remote(num_gpus=gpus, max_calls=1) if gpus else self.cluster.ray.remote
+            remote = self._remote[task.function] = decorate(task.function)
+        options = {"max_retries": 0, "name": f"shard-{task.key}", **self.cluster.requirements}
         return remote.options(**options).remote(*task.arguments())
 
     def _finished(self, references: list[Any]) -> list[Any]:
-        try:
-            return self.cluster.ray.wait(references, num_returns=len(references), timeout=_WAIT_S)[0]
-        except (self.cluster.ray.exceptions.RaySystemError, ConnectionError) as error:
-            raise StudyError(f"the connection to the Ray cluster is lost: {first_line(error)}") from None
+        if not references:
+            time.sleep(_WAIT_S)
+            return []
+        return list(self.cluster.ray.wait(references, num_returns=len(references), timeout=_WAIT_S)[0])
 
-    def _take(self, reference: Any, task: Task, tries: _Tries) -> tuple[bool, Any]:
+    def _check_head(self) -> None:
+        """Ask now and then whether the head is there, and whether some node can take a task.
+
+        Raises:
+            StudyError: the head has not answered for some time.
+        """
+        now = time.monotonic()
+        if now - self._asked < _LONELY_S:
+            return
+        self._asked = now
+        if self.cluster.answers():
+            if not self._told and not self.cluster.slots():
+                self._told = True
+                self.on_event("waiting", error=f"no node can take a shard, which needs {self.cluster.shortage()}")
+            self._answered = now
+        elif now - self._answered > _SILENCE_S:
+            self._lost = True
+            raise StudyError(f"the head of the Ray cluster, {self.cluster.head}, does not answer any more")
+
+    def _resolve(self, reference: Any, task: Task, failures: _Failures) -> tuple[bool, Any]:
         """Return ``(True, result)``, or ``(False, None)`` if the task is to be submitted again."""
         exceptions = self.cluster.ray.exceptions
         try:
             return True, self.cluster.ray.get(reference)
         except exceptions.RayTaskError as error:
             cause = error.cause if isinstance(error.cause, BaseException) else error
-            tries.errors += 1
-            if tries.errors > self.cluster.options.retries or isinstance(cause, UserError):
-                return True, TaskError(f"{type(cause).__name__}: {cause}", str(error), cause)
-            self.on_event("retried", task=task.key, error=f"{type(cause).__name__}: {cause}")
-        except exceptions.NodeDiedError as error:
+            failures.errors += 1
+            if failures.errors > self.cluster.options.retries or isinstance(cause, UserError):
+                return True, TaskError(f"{type(cause).__name__}: {cause}", _without_colours(str(error)), cause)
+            self.on_event("retried", task=task.key, error=f"{type(cause).__name__}: {first_line(cause)}")
+        except (exceptions.NodeDiedError, exceptions.ObjectLostError) as error:
             self.on_event("lost", task=task.key, error=first_line(error))
         except (
             exceptions.TaskUnschedulableError,
@@ -134,19 +185,20 @@ class TaskRun:
             return True, TaskError(first_line(error), traceback.format_exc(), error)
         except exceptions.RayError as error:  # the process died: killed, out of memory, past its time limit
             position = task.position()
-            tries.crashes = 1 if position != tries.position else tries.crashes + 1
-            tries.position = position
-            if tries.crashes > _CRASHES:
+            failures.crashes = 1 if position != failures.position else failures.crashes + 1
+            failures.position = position
+            if failures.crashes >= _MAX_CRASHES:
                 return True, TaskError(
-                    f"its process died {tries.crashes} times in a row: {first_line(error)}", "", error
+                    f"its process died {failures.crashes} times in a row: {first_line(error)}", "", error
                 )
-            self.on_event("lost", task=task.key, error=first_line(error))
+            failures.not_before = time.monotonic() + min(0.5 * 2**failures.crashes, _MAX_BACKOFF_S)
+            self.on_event("lost", task=task.key, error=f"{type(error).__name__}: {first_line(error)}")
         return False, None
 
     def _cancel(self, references: list[Any]) -> None:
         """Cancel tasks, and wait until they have saved their work."""
-        ray, deadline = self.cluster.ray, time.monotonic() + _GRACE_S
-        if not references or not ray.is_initialized():
+        ray, deadline = self.cluster.ray, time.monotonic() + self.grace_s
+        if not references or self._lost or not ray.is_initialized():
             return
         try:
             for reference in references:
@@ -155,3 +207,8 @@ class TaskRun:
                 references = ray.wait(references, num_returns=len(references), timeout=1.0)[1]
         except (ray.exceptions.RayError, ConnectionError, ValueError):
             return
+
+
+def _without_colours(text: str) -> str:
+    """Return a text without the terminal's escape sequences, which Ray puts into tracebacks."""
+    return re.sub(r"\x1b\[[0-9;]*m", "", text)

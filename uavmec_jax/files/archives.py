@@ -93,7 +93,7 @@ def open_checked(
     except (UserError, StoreError):
         raise
     except _READ_ERRORS as problem:
-        raise error(f"{path}: cannot be read: {problem}") from None
+        raise error(f"{path}: cannot be read: {problem}") from problem
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import secrets
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -60,7 +61,7 @@ def atomic(path: Path) -> Iterator[Path]:
     a local ``path``; an object store gets the whole file at once, as one object.
     """
     if is_local(path):
-        partial = path.with_name(f".{path.stem}.part{path.suffix}")
+        partial = path.with_name(f".{path.stem}-{secrets.token_hex(4)}.part{path.suffix}")
         try:
             yield partial
             partial.replace(path)

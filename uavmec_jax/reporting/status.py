@@ -22,14 +22,14 @@ def status_lines(status: Status) -> list[str]:
         left = datetime.timedelta(seconds=round(status.seconds_left))
         lines.append(f"speed: {status.steps_per_second:,.0f} steps/s, training left: {left}")
     if status.retries:
-        lines.append(f"attempts that were repeated: {status.retries:,}")
+        lines.append(f"retries: {status.retries:,}")
     if len(status.nodes) > 1:
         lines += _truncate([f"node {node}: {count} shards" for node, count in status.nodes.items()])
     lines += _truncate(status.running)
     lines += _truncate([f"shard {number} failed: {why}" for number, why in status.failures.items()])
     if not status.complete:
-        resume = f"nobody is working on it; resume with: uavmec resume {status.directory}"
-        lines.append(f"carried out by {status.owner}" if status.owner else resume)
+        resume = f"no driver is running; resume with: uavmec resume {status.directory}"
+        lines.append(f"driver: {status.owner}" if status.owner else resume)
     return lines
 
 

@@ -101,6 +101,8 @@ class Checkpoints:
             try:
                 progress = self._restore(path, training)
             except StudyError as error:
+                if isinstance(error.__cause__, OSError) and path.exists():
+                    raise error.__cause__ from None  # the file server's fault, not the file's
                 self.log_event("damaged", file=path.name, error=str(error))
                 set_aside(path)
                 training = start()

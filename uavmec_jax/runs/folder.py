@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from uavmec_jax.errors import StudyError
-from uavmec_jax.files.locations import files_in_subfolders, files_matching, reached
+from uavmec_jax.files.locations import files_in_subfolders, files_matching, is_local, reached
 from uavmec_jax.files.locks import is_known_dead
 from uavmec_jax.files.reading import read_json_or_empty, read_text
 from uavmec_jax.files.writing import write_text
@@ -126,9 +126,7 @@ class RunFolder:
 
     def other_code(self) -> list[str]:
         """List how code and libraries differ from those that the run was planned with."""
-        now = {"uavmec_jax's code": host.code_digest()} | host.versions()
-        then = {"uavmec_jax's code": self.facts["code_sha256"]} | self.facts["versions"]
-        return [f"{name} {then.get(name, '?')[:12]} -> {now[name][:12]}" for name in now if now[name] != then.get(name)]
+        return host.code_differences({"uavmec_jax's code": self.facts["code_sha256"]} | self.facts["versions"])
 
     def check_code(self) -> None:
         """Check that code and libraries are those of the run plan: only then are the results the same to the bit.
@@ -197,16 +195,22 @@ class RunFolder:
         for shard in self.plan.shards:
             present = sorted(files.get(f"{shard.number:05d}", ()), key=lambda file: file.name)
             reports = [file for file in present if file.name.startswith(f"{PROGRESS}-")]
-            report = read_json_or_empty(reports[-1]) if reports else {}
-            report["attempts"] = len(reports)
+            attempts = {"attempts": len(reports)}
             if complete or any(file.name.startswith(f"{RESULT}-") for file in present):
-                yield shard, "done", report
+                yield shard, "done", attempts
             elif any(file.name == FAILURE for file in present):
-                yield shard, "failed", report | read_json_or_empty(self.failure(shard))
+                yield shard, "failed", attempts | read_json_or_empty(self.failure(shard))
             elif reports:
+                report = read_json_or_empty(reports[-1]) | attempts
                 yield shard, "running" if _is_running(report) else "stopped", report
             else:
                 yield shard, "waiting", {}
+
+    def remove_partial_files(self) -> None:
+        """Remove what attempts that were killed have left of checkpoints; only where no other process works."""
+        if is_local(self.shards_folder):
+            for file in self.shards_folder.glob("*/.*.part.*"):
+                file.unlink(missing_ok=True)
 
 
 def _is_running(report: dict[str, Any]) -> bool:

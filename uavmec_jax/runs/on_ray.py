@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
 
-from uavmec_jax.cluster.connection import Cluster, cpus_per_shard
-from uavmec_jax.cluster.tasks import Task, TaskError, TaskRun
-from uavmec_jax.cluster.worker import node_name, time_limit
-from uavmec_jax.errors import UserError
+from uavmec_jax.cluster.connection import Cluster
+from uavmec_jax.cluster.tasks import GRACE_S, Task, TaskError, TaskRun
+from uavmec_jax.cluster.worker import node_name
+from uavmec_jax.errors import StudyError, UserError
 from uavmec_jax.files.locations import absolute, files_matching, to_path
 from uavmec_jax.runs.attempt import Attempt
 from uavmec_jax.runs.folder import CHECKPOINT, LOG, RunFolder
@@ -20,16 +20,19 @@ from uavmec_jax.runs.log import RunLog
 from uavmec_jax.runs.run_plan import Shard
 from uavmec_jax.runs.shard_runner import ShardRunner
 from uavmec_jax.runs.signals import StopSignal
-from uavmec_jax.training import host
+from uavmec_jax.training.machine import WorkerOptions
 from uavmec_jax.training.population import Progress
 
-_LOOK_EVERY_S = 1.0
+_POLL_EVERY_S = 1.0
 """Least seconds between two looks at the reports of all attempts."""
+
+_SAVED_PER_SECOND = 30e6
+"""Bytes of a checkpoint that shards on slow, shared storage surely write in a second."""
 
 _NODES_SHOWN = 4
 """Nodes that the progress bar names."""
 
-_LOOK_SHARE = 0.05
+_POLL_SHARE = 0.05
 """Largest share of the driver's time that these looks take."""
 
 
@@ -39,8 +42,6 @@ def run_on_ray(
     stop: StopSignal,
     log: RunLog,
     on_progress: OnProgress,
-    *,
-    other_code: bool = False,
 ) -> None:
     """Make attempts at every shard that is neither finished nor failed, until it is.
 
@@ -49,12 +50,12 @@ def run_on_ray(
         StudyError: a file could not be written, the nodes have other code, or the connection to the cluster is lost.
     """
     open_shards = {s.number: s for s, state, _ in folder.states() if state not in ("done", "failed")}
-    watch = _Watch(folder, on_progress)
+    monitor, worker = _ProgressMonitor(folder, on_progress), WorkerOptions.of(cluster)
 
     def task_of(shard: Shard) -> Task:
         def arguments() -> tuple[Any, ...]:
             attempt = folder.new_attempt(shard)
-            return absolute(folder.path), shard.number, attempt, _Worker.of(cluster, other_code)
+            return absolute(folder.path), folder.fingerprint, shard.number, attempt, worker
 
         def position() -> list[str]:
             return [file.name for file in files_matching(folder.shard_folder(shard), f"{CHECKPOINT}-*.npz")]
@@ -63,18 +64,19 @@ def run_on_ray(
 
     def on_wait() -> None:
         stop.check()
-        watch.look()
+        monitor.poll()
 
-    def on_event(event: str, *, task: int, error: str) -> None:
-        log.event(event, shard=task, error=error)
+    def on_event(event: str, *, error: str, task: int | None = None) -> None:
+        log.event(event, **({} if task is None else {"shard": task}), error=error)
 
-    run = TaskRun(cluster, on_wait, on_event)
+    largest = max((partition.shard_bytes for partition in folder.plan.partitions.values()), default=0)
+    run = TaskRun(cluster, on_wait, on_event, grace_s=GRACE_S + largest / _SAVED_PER_SECOND)
     # closing: an error here must cancel the other attempts now, not when its traceback is let go
     with closing(run.results(map(task_of, open_shards.values()))) as outcomes:
         for number, outcome in outcomes:
             if isinstance(outcome, TaskError):
                 _give_up(folder, open_shards[number], outcome, log)
-    watch.look(last=True)
+    monitor.poll(last=True)
 
 
 def _give_up(folder: RunFolder, shard: Shard, failed: TaskError, log: RunLog) -> None:
@@ -87,14 +89,14 @@ def _give_up(folder: RunFolder, shard: Shard, failed: TaskError, log: RunLog) ->
 
 
 @dataclass
-class _Watch:
+class _ProgressMonitor:
     """Reports the progress of all attempts, from what they write."""
 
     folder: RunFolder
     on_progress: Callable[[Progress], None]
     _next: float = field(default_factory=time.monotonic)
 
-    def look(self, *, last: bool = False) -> None:
+    def poll(self, *, last: bool = False) -> None:
         started = time.monotonic()
         if started < self._next and not last:
             return
@@ -111,45 +113,36 @@ class _Watch:
                 nodes[str(report.get("node"))] += 1
         detail = ", ".join(f"{count} on {node}" for node, count in sorted(nodes.items())[:_NODES_SHOWN])
         detail += f" and {len(nodes) - _NODES_SHOWN} more nodes" * (len(nodes) > _NODES_SHOWN)
-        detail += f"; {retries} repeated" * (retries > 0)
+        detail += f"; {retries} retries" * (retries > 0)
         self.on_progress(Progress(max(closed - 1, 0), steps, plan.work, float("nan"), detail))
         ended = time.monotonic()
-        self._next = ended + max(_LOOK_EVERY_S, (ended - started) / _LOOK_SHARE)
+        self._next = ended + max(_POLL_EVERY_S, (ended - started) / _POLL_SHARE)
 
 
-@dataclass(frozen=True)
-class _Worker:
-    """What the process of an attempt is told."""
-
-    devices: int
-    other_code: bool
-    time_limit_s: float | None
-
-    @classmethod
-    def of(cls, cluster: Cluster, other_code: bool) -> "_Worker":
-        return cls(cpus_per_shard(cluster.options), other_code, cluster.options.time_limit_s)
-
-
-def attempt_shard(directory: str, number: int, attempt: str, worker: _Worker) -> None:
+def attempt_shard(directory: str, fingerprint: str, number: int, attempt: str, worker: WorkerOptions) -> None:
     """Make an attempt at a shard; this runs on a node."""
-    host.use_all_cores(worker.devices)
-    folder, runner = _open(directory, worker.other_code)
-    shard = folder.plan.shards[number]
-    if folder.is_closed(shard):  # by an attempt that was believed dead
-        return
-    context = {"node": node_name(), "attempt": attempt}
-    log = RunLog(folder.path / LOG, tensorboard=folder.options.tensorboard, context=context)
-    try:
-        with StopSignal() as stop, time_limit(worker.time_limit_s):
-            Attempt(folder, shard, attempt, runner, stop, log, node=node_name()).run()
-    finally:
-        log.close()
+    with worker.prepared():
+        folder, runner = _open(directory, fingerprint)
+        shard = folder.plan.shards[number]
+        if folder.is_closed(shard):  # by an attempt that was believed dead
+            return
+        context = {"node": node_name(), "attempt": attempt}
+        log = RunLog(folder.path / LOG, tensorboard=folder.options.tensorboard, context=context)
+        try:
+            with StopSignal() as stop:
+                Attempt(folder, shard, attempt, runner, stop, log, node=node_name()).run()
+        finally:
+            log.close()
 
 
 @lru_cache(maxsize=1)
-def _open(directory: str, other_code: bool) -> tuple[RunFolder, ShardRunner]:
-    """Open the run; the programs that are compiled for its first shard serve the others in this process."""
+def _open(directory: str, fingerprint: str) -> tuple[RunFolder, ShardRunner]:
+    """Open the run; the programs that are compiled for its first shard serve the others in this process.
+
+    Raises:
+        StudyError: the folder holds another run than the driver's, or none: this node does not share it.
+    """
     folder = RunFolder.open(to_path(directory))
-    if not other_code:
-        folder.check_code()
+    if folder.fingerprint != fingerprint:
+        raise StudyError(f"{directory}: holds another run here than on the driver's machine; the nodes must share it")
     return folder, ShardRunner(folder.study, folder.plan)

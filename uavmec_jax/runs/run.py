@@ -88,7 +88,7 @@ def run_study(
     if options.tensorboard:
         tensorboard_writer()
     with nullcontext() if path is None else reached(path), connected(ray) as cluster:
-        machine = probe_node(cluster) if cluster else None
+        machine = probe_node(cluster, lambda event, **facts: on_event(event, facts)) if cluster else None
         plan = plan_run(study, shard_size=shard_size, machine=machine)
         on_plan(plan)
         label = label_of(study, plan, command)
@@ -143,8 +143,13 @@ def resume_run(
         if not other_code:
             folder.check_code()
         with lock_folder(folder.shards_folder, path, take_over=take_over), connected(ray) as cluster:
-            for shard in folder.plan.shards:
-                folder.failure(shard).unlink(missing_ok=True)
+            if folder.complete:  # by the process that has just let go of it
+                remove_folder(folder.shards_folder)
+                return load_results(path)
+            folder.remove_partial_files()
+            for shard, state, _ in folder.states():
+                if state == "failed":
+                    folder.failure(shard).unlink(missing_ok=True)
             label = {"other_code": differ} if (differ := folder.other_code()) else {}
             return _run(folder, reward, cluster, on_progress, on_event, label)
 
@@ -198,7 +203,7 @@ def _run(
                 if cluster is None:
                     run_here(folder, ShardRunner(folder.study, folder.plan, reward), stop, log, on_progress)
                 else:
-                    run_on_ray(folder, cluster, stop, log, on_progress, other_code=bool(label))
+                    run_on_ray(folder, cluster, stop, log, on_progress)
                 finished, damaged = read_finished_shards(folder, log.event)
         except KeyboardInterrupt as interrupt:
             results = partial_results(folder)

@@ -22,7 +22,7 @@ from uavmec_jax.studies.measures import with_measures
 from uavmec_jax.studies.parts import split_study
 from uavmec_jax.studies.population import cell_axes
 from uavmec_jax.studies.schema import PLANNERS, Study
-from uavmec_jax.studies.shard_result import ShardResult, wall_seconds
+from uavmec_jax.studies.shard_result import ShardResult, total_seconds
 from uavmec_jax.studies.statistics import mean_interval
 from uavmec_jax.studies.study import study_toml
 
@@ -88,28 +88,23 @@ class Results:
             shards: results of the finished shards, in the order of the run plan.
             agents: number of agents in the whole study.
         """
-        results = cls(study, dict(label))
-        seconds: dict[str, float] = {}
-        worked: list[tuple[float, float]] = []
-        rows: list[pd.DataFrame] = []
+        results, shards = cls(study, dict(label)), list(shards)
         curves: dict[str, list[Mapping]] = {}
-        evaluation, weights = [], []
-        steps = 0
+        weights = []
         for shard in shards:
-            rows.append(shard.rows)
-            evaluation.append(shard.evaluation)
             if shard.curves:
                 curves.setdefault(shard.algorithm, []).append(shard.curves)
                 weights.append(traverse_util.flatten_dict({shard.algorithm: shard.weights}, sep="/"))
-            steps += shard.steps
-            worked.append(shard.worked)
-            for activity, spent in shard.seconds.items():
-                seconds[activity] = seconds.get(activity, 0.0) + spent
         results.curves = {name: _concatenate(pieces) for name, pieces in curves.items()}
-        results.evaluation, results.weights = _concatenate(evaluation), _concatenate(weights)
-        if rows:
-            results.agents = with_measures(study, pd.concat(rows, ignore_index=True), results.evaluation)
-        results._add_totals(agents, steps, seconds | {"wall": wall_seconds(worked)})
+        results.evaluation = _concatenate([shard.evaluation for shard in shards])
+        results.weights = _concatenate(weights)
+        if shards:
+            rows = pd.concat([shard.rows for shard in shards], ignore_index=True)
+            results.agents = with_measures(study, rows, results.evaluation)
+        processors = {shard.processor for shard in shards}
+        if processors - {results.run.get("processor")}:
+            results.run["processors"] = sorted(processors)  # bits are promised for one model
+        results._add_totals(agents, sum(shard.steps for shard in shards), total_seconds(shards))
         return results
 
     def _add_totals(self, agents: int, steps: int, seconds: dict[str, float]) -> None:

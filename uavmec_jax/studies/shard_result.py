@@ -1,6 +1,7 @@
 """Results of one finished shard, in one checked file: rows, curves, evaluation and weights."""
 
 import time
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +13,7 @@ from flax import traverse_util
 
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files.archives import read_checked, write_checked
+from uavmec_jax.training import host
 
 SHARD_SCHEMA = 2
 """Version of the file format."""
@@ -31,6 +33,7 @@ class ShardResult:
         seconds: time spent, by activity.
         steps: environment steps of all agents together.
         ended_at: when it was finished, in seconds since the epoch.
+        processor: name of the processor that did the work.
     """
 
     algorithm: str
@@ -41,6 +44,7 @@ class ShardResult:
     seconds: dict[str, float]
     steps: int
     ended_at: float = field(default_factory=time.time)
+    processor: str = field(default_factory=host.processor)
 
     @property
     def worked(self) -> tuple[float, float]:
@@ -60,7 +64,7 @@ class ShardResult:
             for name, leaf in traverse_util.flatten_dict(tree, sep="/").items()
         }
         facts = {"algorithm": self.algorithm, "seconds": self.seconds, "steps": self.steps}
-        facts |= {"columns": [*self.rows], "ended_at": self.ended_at}
+        facts |= {"columns": [*self.rows], "ended_at": self.ended_at, "processor": self.processor}
         write_checked(path, SHARD_SCHEMA, facts, arrays, compressed=False)
 
     @classmethod
@@ -89,13 +93,18 @@ class ShardResult:
             seconds=facts["seconds"],
             steps=facts["steps"],
             ended_at=facts["ended_at"],
+            processor=facts["processor"],
         )
 
 
-def wall_seconds(worked: Iterable[tuple[float, float]]) -> float:
-    """Return the time that intervals cover together, such as those in which shards were worked on."""
-    total, until = 0.0, float("-inf")
-    for first, last in sorted(worked):
-        total += max(last - max(first, until), 0.0)
+def total_seconds(shards: Iterable[ShardResult]) -> dict[str, float]:
+    """Return the seconds of all shards by activity; ``wall`` is the time in which at least one of them was worked on."""
+    shards = list(shards)
+    totals: Counter[str] = Counter()
+    for shard in shards:
+        totals.update(shard.seconds)
+    wall, until = 0.0, float("-inf")
+    for first, last in sorted(shard.worked for shard in shards):
+        wall += max(last - max(first, until), 0.0)
         until = max(until, last)
-    return total
+    return {**totals, "wall": wall}

@@ -12,6 +12,8 @@ from typing import Any
 import jax
 import psutil
 
+from uavmec_jax.errors import StudyError
+
 MEMORY_SHARE = 0.8
 """Share of the free memory that a run may use."""
 
@@ -33,6 +35,19 @@ def use_all_cores(most: int | None = None) -> None:
         jax.config.update("jax_num_cpu_devices", min(n_cores, most or n_cores))
     except RuntimeError:  # the backend is already running
         return
+
+
+def use_devices(cpus: int, gpus: int) -> None:
+    """Make JAX use so many cores, or so many GPUs. Call this before JAX is first used.
+
+    Raises:
+        StudyError: GPUs are wanted and JAX sees another number of them.
+    """
+    if not gpus:
+        jax.config.update("jax_platforms", "cpu")
+        use_all_cores(cpus)
+    elif jax.default_backend() == "cpu" or jax.local_device_count() != gpus:
+        raise StudyError(f"JAX sees {jax.local_device_count()} x {jax.default_backend()} where {gpus} GPUs are wanted")
 
 
 def free_memory() -> int:
@@ -70,6 +85,17 @@ def code_digest() -> str:
     for file in sorted(root.rglob("*.py")):
         digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()
+
+
+def code() -> dict[str, str]:
+    """Return what the bits of a run depend on besides its plan and the processor: this package's code, and the versions."""
+    return {"uavmec_jax's code": code_digest()} | versions()
+
+
+def code_differences(then: dict[str, str]) -> list[str]:
+    """List how the code here differs from another one that :func:`code` returned, then or elsewhere."""
+    now = code()
+    return [f"{name} {then.get(name, '?')[:12]} -> {now[name][:12]}" for name in now if now[name] != then.get(name)]
 
 
 def describe() -> dict[str, Any]:

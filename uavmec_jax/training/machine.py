@@ -1,14 +1,16 @@
 """What a shard has for its training, on this machine or on a node of a cluster."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import jax
 
 from uavmec_jax.cluster.connection import Cluster, cpus_per_shard, n_cores
 from uavmec_jax.cluster.tasks import Task, TaskError, TaskRun
-from uavmec_jax.cluster.worker import node_name
-from uavmec_jax.errors import StudyError
+from uavmec_jax.cluster.worker import node_name, time_limit
+from uavmec_jax.errors import StudyError, UserError
 from uavmec_jax.training import host
 from uavmec_jax.training.partition import Partition, partition_population
 
@@ -43,26 +45,64 @@ class Machine:
         )
 
 
-def probe_node(cluster: Cluster) -> Machine:
+@dataclass(frozen=True)
+class WorkerOptions:
+    """What the process of a task is told.
+
+    Attributes:
+        cpus, gpus: what the task may use.
+        code: the driver's, see :func:`host.code`.
+        time_limit_s: seconds after which the process is ended.
+    """
+
+    cpus: int
+    gpus: int
+    code: dict[str, str]
+    time_limit_s: float | None
+
+    @classmethod
+    def of(cls, cluster: Cluster) -> "WorkerOptions":
+        """Return what the tasks on a cluster are told."""
+        options = cluster.options
+        return cls(cpus_per_shard(options), options.gpus_per_shard, host.code(), options.time_limit_s)
+
+    @contextmanager
+    def prepared(self) -> Iterator[None]:
+        """Prepare this process, which is on a node, and name the node in errors.
+
+        Raises:
+            StudyError: the node has other code than the driver, or not the GPUs; or what is raised inside.
+        """
+        with time_limit(self.time_limit_s):
+            try:
+                if differ := host.code_differences(self.code):
+                    raise StudyError(f"has other code than the driver ({', '.join(differ)}); install the same there")
+                host.use_devices(self.cpus, self.gpus)
+                yield
+            except UserError as error:
+                raise StudyError(f"node {node_name()}: {error}") from error
+
+
+def probe_node(cluster: Cluster, on_event: Callable[..., None] = lambda event, **facts: None) -> Machine:
     """Return what a shard has on a node of the cluster, which may be waited for.
 
+    Args:
+        cluster: the cluster.
+        on_event: called with ``("waiting", error=...)`` if no node can take a shard.
+
     Raises:
-        StudyError: the package on the node is another version.
+        StudyError: the node has other code than the driver, or not the GPUs.
     """
-    task = Task("probe", _describe_node, lambda: (cpus_per_shard(cluster.options), host.code_digest(), host.versions()))
-    ((_, machine),) = TaskRun(cluster).results([task])
+    task = Task("probe", _describe_node, lambda: (WorkerOptions.of(cluster),))
+    ((_, machine),) = TaskRun(cluster, on_event=on_event).results([task])
     if isinstance(machine, TaskError):
-        raise StudyError(f"a node of the Ray cluster: {machine.error}")
+        raise StudyError(machine.error.removeprefix("StudyError: "))
     return Machine(**machine)
 
 
-def _describe_node(devices: int, code: str, versions: dict[str, str]) -> dict[str, Any]:
+def _describe_node(worker: WorkerOptions) -> dict[str, Any]:
     """Return the fields of :class:`Machine`; this runs on a node."""
-    host.use_all_cores(devices)
-    here = {"uavmec_jax's code": host.code_digest()} | host.versions()
-    there = {"uavmec_jax's code": code} | versions
-    if differ := [f"{name} {there[name][:12]} -> {here[name][:12]}" for name in here if here[name] != there[name]]:
-        raise StudyError(f"{node_name()} has other code than the driver ({', '.join(differ)}); install the same there")
-    machine = Machine.here()
-    share = 1.0 if machine.accelerator else min(devices / n_cores(), 1.0)  # other shards may be on the node too
-    return vars(replace(machine, free_bytes=int(share * machine.free_bytes)))
+    with worker.prepared():
+        free = host.free_memory()
+    share = 1.0 if worker.gpus else min(worker.cpus / n_cores(), 1.0)  # other shards may be on the node too
+    return {"devices": worker.gpus or worker.cpus, "accelerator": worker.gpus > 0, "free_bytes": int(share * free)}

@@ -12,12 +12,11 @@ from jaxtyping import Array, Float, Key
 
 from uavmec_jax.agents.algorithm import Agent, Algorithm
 from uavmec_jax.agents.registry import ALGORITHMS
-from uavmec_jax.cluster.connection import Cluster, cpus_per_shard
+from uavmec_jax.cluster.connection import Cluster
 from uavmec_jax.cluster.tasks import Task, TaskError, TaskRun
-from uavmec_jax.cluster.worker import time_limit
 from uavmec_jax.errors import StudyError, UserError
-from uavmec_jax.training import host
 from uavmec_jax.training.chunks import Validation
+from uavmec_jax.training.machine import WorkerOptions
 from uavmec_jax.training.partition import Partition
 from uavmec_jax.training.population import take_padded
 from uavmec_jax.training.to_host import from_host, to_host
@@ -133,7 +132,7 @@ class PopulationOnRay:
     def _run(self, until: int | None, on_shard: Callable[[int], None]) -> list[Any]:
         shards = len(self.saved)
         results: dict[int, Any] = {}
-        worker = _Worker(cpus_per_shard(self.cluster.options), self.cluster.options.time_limit_s)
+        worker = WorkerOptions.of(self.cluster)
 
         def task_of(number: int) -> Task:
             def arguments() -> tuple[Any, ...]:
@@ -159,14 +158,6 @@ def _failure(number: int, shards: int, failed: TaskError) -> UserError:
 
 
 @dataclass(frozen=True)
-class _Worker:
-    """What the process of a task is told."""
-
-    devices: int
-    time_limit_s: float | None
-
-
-@dataclass(frozen=True)
 class _Example:
     """A shard's agents and the keys of their validations; equal to every other shard of the same shape."""
 
@@ -180,7 +171,7 @@ class _Example:
 
 
 def train_shard(
-    worker: _Worker,
+    worker: WorkerOptions,
     program: ShardProgram,
     population: Any,
     agents: int,
@@ -189,9 +180,8 @@ def train_shard(
     until: int | None,
 ) -> SavedShard | TrainedShard:
     """Train a shard of a population of so many agents; this runs on a node."""
-    host.use_all_cores(worker.devices)
     size = program.partition.shard_size
-    with time_limit(worker.time_limit_s):
+    with worker.prepared():
         members = from_host(take_padded(population, number * size, size))
         training = _trainer(program, _Example.of(members)).start(*members)
         if saved is not None:
