@@ -50,6 +50,7 @@ FILES = ("agents.csv", "curves.npz", "evaluation.npz", "weights.npz", "study.tom
 NODES, CPUS = 3, 2
 TIME_LIMIT_S = 20
 PATIENCE_S = 300.0
+RESUMES = 6
 PLAN = {
     "process of a shard killed": 12,
     "node killed": 8,
@@ -118,12 +119,19 @@ class Run:
         )
 
     def end(self) -> int:
-        """Wait for the driver; return its exit code and keep its last line."""
+        """Wait for the driver; return its exit code, and keep the line with which it gave up.
+
+        Raises:
+            AssertionError: it gave up in another way than with one line and exit code 2.
+        """
         assert self.process is not None
         _, errors = self.process.communicate(timeout=PATIENCE_S)
-        if self.process.returncode not in (0, -signal.SIGKILL):
-            self.lines.append(errors.strip().rpartition("\n")[2])
-        return self.process.returncode
+        code = self.process.returncode
+        if code not in (0, -signal.SIGKILL, 128 + signal.SIGTERM):
+            *others, last = [line for line in errors.splitlines() if not line.startswith("[")]  # those are Ray's own
+            assert code == 2 and not others, f"exit code {code}: {errors}"  # noqa: PT018
+            self.lines.append(last)
+        return code
 
     @property
     def ended(self) -> bool:
@@ -251,7 +259,6 @@ def stop(run: Run) -> None:
     assert run.process is not None
     run.process.send_signal(signal.SIGTERM)
     run.end()
-    run.lines.clear()
 
 
 def _log(run: Run) -> str:
@@ -274,7 +281,7 @@ def disturbed(run: Run, left: list[str]) -> list[dict]:
     """Carry a run out while faults strike, at most three of them; return a row for each."""
     rows: list[dict] = []
     run.start()
-    while True:
+    for _ in range(1 + RESUMES):
         while left and len(rows) < 3 and run.wait_for_a_moment():
             kind = left[-1]
             started = time.monotonic()
@@ -286,6 +293,8 @@ def disturbed(run: Run, left: list[str]) -> list[dict]:
         if code == 0:
             break
         run.start(ray=run.chance.random() > 0.5)
+    else:
+        raise AssertionError(f"{run.folder}: does not end, however often it is resumed: {run.lines}")
     for row in rows:
         row["lines"] = len(run.lines)
         row["line"] = " | ".join(run.lines)
@@ -312,8 +321,10 @@ def main() -> None:
     assert whole.end() == 0, whole.lines
     bits = {name: (whole.folder / name).read_bytes() for name in FILES}
     rows: list[dict] = []
-    while left:
-        run = Run(work / f"run-{len(rows):02d}", nodes, chance)
+    for number in range(4 * len(left)):  # a run may end before a fault strikes
+        if not left:
+            break
+        run = Run(work / f"run-{number:02d}", nodes, chance)
         started = time.monotonic()
         new = disturbed(run, left)
         nodes = run.nodes
