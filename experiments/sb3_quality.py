@@ -130,6 +130,7 @@ def measure_sb3() -> pd.DataFrame:
     return pd.DataFrame(
         {
             "learner": "Stable-Baselines3 DQN, nearest setting",
+            "agents": len(curves),
             "steps": steps[0].astype(int),
             "seconds": seconds.mean(0) / cores,
             "share": lifetime.sum(0) / bound.sum(0),

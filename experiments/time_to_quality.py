@@ -71,6 +71,7 @@ def measure(name: str, seeds: int, every: int, steps: int | None) -> pd.DataFram
     return pd.DataFrame(
         {
             "learner": name,
+            "agents": n,
             "steps": look_steps,
             "seconds": seconds / n,
             "share": lifetimes.mean(0) / bounds.mean(),
@@ -120,19 +121,25 @@ def main() -> None:
         curves.append(measure(name, arguments.seeds, arguments.every, arguments.steps))
         share, seconds = curves[-1][["share", "seconds"]].iloc[-1]
         print(f"{name}: {share:.2%} of the bound, {seconds:.2f} s", flush=True)
-    curves = with_earlier(curves, arguments.out / "time_to_quality.csv")
+    report_on(with_earlier(curves, arguments.out / "time_to_quality.csv"), arguments.out)
+
+
+def report_on(curves: list[pd.DataFrame], out: Path) -> None:
+    """Write the table, the figure, and the seconds to each share of the bound."""
     report: dict[str, Any] = {"command": "python experiments/time_to_quality.py", **host.describe(), "learners": {}}
     for curve in curves:
-        times = {f"{share:.2f}": time_to(curve, share) for share in SHARES}
+        seconds = {f"{share:.2f}": time_to(curve, share) for share in SHARES}
+        times = {share: None if np.isnan(spent) else round(spent, 4) for share, spent in seconds.items()}
         last = {"share": float(curve["share"].iloc[-1]), "worst_cell": float(curve["worst_cell"].iloc[-1])}
         spread = float(np.ptp(curve["share"].iloc[-20:]) / curve["share"].iloc[-20:].mean())
-        name = str(curve["learner"].iloc[0])
-        report["learners"][name] = {"seconds_to": times, "last": last, "spread_of_20_looks": spread}
-        print(name, {share: round(seconds, 3) for share, seconds in times.items()}, last, round(spread, 4))
-    write_report(arguments.out / "time_to_quality.json", report)
+        name, agents = str(curve["learner"].iloc[0]), int(curve["agents"].iloc[0])
+        learner = {"agents": agents, "seconds_to": times, "last": last, "spread_of_mean_over_20_looks": spread}
+        report["learners"][name] = learner
+        print(name, times, last, round(spread, 4))
+    write_report(out / "time_to_quality.json", report)
     table = pd.concat(curves)
-    table.to_csv(arguments.out / "time_to_quality.csv", index=False, float_format="%.5g")
-    quality_figure(table, arguments.out / "time_to_quality.png")
+    table.to_csv(out / "time_to_quality.csv", index=False, float_format="%.5g")
+    quality_figure(table, out / "time_to_quality.png")
 
 
 if __name__ == "__main__":
