@@ -33,6 +33,10 @@ GRACE_S = 120.0
 """Seconds that cancelled tasks have to save their work."""
 
 
+class ClusterLostError(StudyError):
+    """The head of the cluster does not answer any more."""
+
+
 @dataclass(frozen=True)
 class Task:
     """A piece of work.
@@ -98,7 +102,7 @@ class TaskRun:
         their work.
 
         Raises:
-            StudyError: the connection to the cluster is lost.
+            ClusterLostError: the head of the cluster does not answer any more.
         """
         waiting = deque(tasks)
         running: dict[Any, Task] = {}
@@ -149,7 +153,7 @@ class TaskRun:
         """Ask now and then whether the head is there, and whether some node can take a task.
 
         Raises:
-            StudyError: the head has not answered for some time.
+            ClusterLostError: the head has not answered for some time.
         """
         now = time.monotonic()
         if now - self._asked < _LONELY_S:
@@ -162,7 +166,7 @@ class TaskRun:
             self._answered = now
         elif now - self._answered > _SILENCE_S:
             self._lost = True
-            raise StudyError(f"the head of the Ray cluster, {self.cluster.head}, does not answer any more")
+            raise ClusterLostError(f"the head of the Ray cluster, {self.cluster.head}, does not answer any more")
 
     def _resolve(self, reference: Any, task: Task, failures: _Failures) -> tuple[bool, Any]:
         """Return ``(True, result)``, or ``(False, None)`` if the task is to be submitted again."""

@@ -9,7 +9,7 @@ from functools import lru_cache
 from typing import Any
 
 from uavmec_jax.cluster.connection import Cluster
-from uavmec_jax.cluster.tasks import GRACE_S, Task, TaskError, TaskRun
+from uavmec_jax.cluster.tasks import GRACE_S, ClusterLostError, Task, TaskError, TaskRun
 from uavmec_jax.cluster.worker import node_name
 from uavmec_jax.errors import StudyError, UserError
 from uavmec_jax.files.locations import absolute, files_matching, to_path
@@ -73,9 +73,12 @@ def run_on_ray(
     run = TaskRun(cluster, on_wait, on_event, grace_s=GRACE_S + largest / _SAVED_PER_SECOND)
     # closing: an error here must cancel the other attempts now, not when its traceback is let go
     with closing(run.results(map(task_of, open_shards.values()))) as outcomes:
-        for number, outcome in outcomes:
-            if isinstance(outcome, TaskError):
-                _give_up(folder, open_shards[number], outcome, log)
+        try:
+            for number, outcome in outcomes:
+                if isinstance(outcome, TaskError):
+                    _give_up(folder, open_shards[number], outcome, log)
+        except ClusterLostError as error:
+            raise StudyError(f"{error}; resume with: uavmec resume {folder.path}") from None
     monitor.poll(last=True)
 
 
