@@ -19,10 +19,11 @@ from uavmec_jax.runs.results_folder import load_results
 from uavmec_jax.studies.results import Results
 
 RUNS = {
-    "the paper's DQN (table5)": "table5",
-    "tuned DQN (table5-best-dqn)": "table5-best-dqn",
-    "PQN (table5-best)": "table5-best",
+    "table5": ("the paper's DQN", "tab:red"),
+    "table5-best-dqn": ("tuned DQN", "tab:blue"),
+    "table5-best": ("PQN", "tab:green"),
 }
+"""Study -> label and colour."""
 LEVELS = {"oldest-first": "oldest_first", "earliest-deadline": "earliest_deadline"}
 
 
@@ -39,12 +40,12 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=Path("results"), help="folder of the three runs")
     parser.add_argument("--out", type=Path, default=Path("results/table5-best"))
     arguments = parser.parse_args()
-    runs = {label: load_results(arguments.results / name) for label, name in RUNS.items()}
+    runs = {study: load_results(arguments.results / study) for study in RUNS}
     figure = canvas.new_figure(9.0, 5.2)
     axis = figure.subplots()
-    for color, (label, results) in zip(("tab:red", "tab:blue", "tab:green"), runs.items(), strict=True):
-        draw_curves(axis, results, label, color)
-    best = runs["PQN (table5-best)"].agents
+    for study, (label, color) in RUNS.items():
+        draw_curves(axis, runs[study], f"{label} ({study})", color)
+    best = runs["table5-best"].agents
     levels = {name: best[f"{column}_lifetime"].mean() for name, column in LEVELS.items()}
     levels["upper bound"] = best["bound_planned"].mean()
     for (name, level), style in zip(levels.items(), ("--", "-.", "-"), strict=True):

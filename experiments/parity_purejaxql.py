@@ -1,7 +1,7 @@
 """Golden numbers from purejaxql, the code of PQN's authors, with which our PQN is compared.
 
-    git clone https://github.com/mttga/purejaxql /tmp/purejaxql
-    uv run python experiments/parity_purejaxql.py --purejaxql /tmp/purejaxql --out tests/golden/purejaxql
+    git clone https://github.com/mttga/purejaxql ../purejaxql
+    uv run python experiments/parity_purejaxql.py --purejaxql ../purejaxql --out tests/golden/purejaxql
 
 Runs one update of the unmodified ``purejaxql/pqn_gymnax.py`` in an environment of random numbers and records the rollout, its
 lambda targets, the weights before each gradient step, the gradients and the mean loss. What that file imports for logging,

@@ -106,14 +106,15 @@ def summarize(results: Results, bound: pd.DataFrame, first: Results) -> dict[str
     others = first.agents.set_index(identity).reindex(agents.index)
     bounds = bound.set_index(identity)["bound_planned"].reindex(agents.index)
     cells = agents.groupby(level=CELL)["last_lifetime"].mean() / bounds.groupby(level=CELL).mean()
-    mean, low, high = mean_interval((agents["last_lifetime"] / bounds).to_numpy())
+    best, last = (100 * agents[f"{which}_lifetime"].mean() / bounds.mean() for which in ("best", "last"))
+    mean, low, high = mean_interval(100 * (agents["last_lifetime"] / bounds).to_numpy())
     gains = 100 * (agents["last_lifetime"] - others["last_lifetime"]) / bounds.mean()
     gain, gain_low, gain_high = mean_interval(gains.to_numpy())
     return {
-        "best": 100 * agents["best_lifetime"].mean() / bounds.mean(),
-        "last": 100 * agents["last_lifetime"].mean() / bounds.mean(),
-        "last_low": 100 * agents["last_lifetime"].mean() / bounds.mean() - 100 * (mean - low),
-        "last_high": 100 * agents["last_lifetime"].mean() / bounds.mean() + 100 * (high - mean),
+        "best": best,
+        "last": last,
+        "last_low": last - (mean - low),
+        "last_high": last + (high - mean),
         "difference": gain,
         "difference_low": gain_low,
         "difference_high": gain_high,

@@ -70,7 +70,7 @@ def sb3_worker(cell: tuple[int, int]) -> None:
 
 
 def scaled(observation: np.ndarray) -> np.ndarray:
-    """Return the paper's 24 numbers with the ages, the second half, times 0.1."""
+    """Return the paper's 24 numbers with the ages times 0.1: :func:`scale_ages` in NumPy, which is faster for one."""
     half = observation.shape[-1] // 2
     return np.concatenate([observation[..., :half], 0.1 * observation[..., half:]], axis=-1)
 

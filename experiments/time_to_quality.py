@@ -11,6 +11,7 @@ rows of an earlier table in the same folder.
 """
 
 import argparse
+import sys
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -126,7 +127,8 @@ def main() -> None:
 
 def report_on(curves: list[pd.DataFrame], out: Path) -> None:
     """Write the table, the figure, and the seconds to each share of the bound."""
-    report: dict[str, Any] = {"command": "python experiments/time_to_quality.py", **host.describe(), "learners": {}}
+    command = " ".join(["python experiments/time_to_quality.py", *sys.argv[1:]])
+    report: dict[str, Any] = {"command": command, **host.describe(), "learners": {}}
     for curve in curves:
         seconds = {f"{share:.2f}": time_to(curve, share) for share in SHARES}
         times = {share: None if np.isnan(spent) else round(spent, 4) for share, spent in seconds.items()}

@@ -25,7 +25,7 @@ def test_time_to_quality(tmp_path):
     learner = "PQN (table5-best)"
     options = ("--steps", 4096, "--every", 2048, "--seeds", 1, "--learners", learner, "--no-sb3", "--out", tmp_path)
     earlier = pd.DataFrame(
-        {"learner": ["another", learner], "steps": 1, "seconds": 1.0, "share": 0.5, "worst_cell": 0.4}
+        {"learner": ["another", learner], "agents": 25, "steps": 1, "seconds": 1.0, "share": 0.5, "worst_cell": 0.4}
     )
     earlier.to_csv(tmp_path / "time_to_quality.csv", index=False)
     run("time_to_quality.py", *options)
@@ -36,6 +36,7 @@ def test_time_to_quality(tmp_path):
     assert curve["seconds"].is_monotonic_increasing
     assert ((curve["share"] > 0.2) & (curve["share"] < 1)).all()
     report = json.loads((tmp_path / "time_to_quality.json").read_text())["learners"][learner]
+    assert report["agents"] == 25
     assert report["last"]["share"] == pytest.approx(curve["share"].iloc[-1], rel=1e-3)
     assert (tmp_path / "time_to_quality.png").stat().st_size > 10_000
 
