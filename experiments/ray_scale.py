@@ -22,9 +22,10 @@ from typing import Any
 
 import psutil
 from reports import write_report
+from simulated_nodes import SimulatedNodes
 
-from uavmec_jax.cluster.connection import connect, prepare_environment
-from uavmec_jax.cluster.options import LOCAL, RayOptions
+from uavmec_jax.cluster.connection import connect
+from uavmec_jax.cluster.options import RayOptions
 
 SETTINGS = ["axes.seeds=4", "steps=400000", "evaluation.planners=[]", "axes.powered=[12,4]", "axes.connected=[8,4]"]
 SHARD_SIZE = 2
@@ -39,7 +40,6 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=Path("runs/ray-scale"))
     parser.add_argument("--out", type=Path, default=Path("results/ray"))
     arguments = parser.parse_args()
-    prepare_environment(LOCAL)
     work = arguments.work.absolute()
     work.mkdir(parents=True)
     settings = [*SETTINGS, *([f"steps={arguments.steps}"] if arguments.steps else [])]
@@ -54,27 +54,6 @@ def main() -> None:
         print(row)
 
 
-def start_cluster(nodes: int, *, pinned: bool) -> Any:
-    """Start a cluster of nodes with one core each; pinned, each keeps to its core."""
-    from ray.cluster_utils import Cluster
-
-    head = {"num_cpus": 0, "node_ip_address": "127.0.0.1", "include_dashboard": False}
-    cluster = Cluster(initialize_head=True, head_node_args=head)
-    cores = sorted(os.sched_getaffinity(0))
-    for k in range(nodes):
-        before = raylets()
-        cluster.add_node(num_cpus=1, node_ip_address="127.0.0.1")
-        if pinned:
-            for process in raylets() - before:
-                process.cpu_affinity([cores[k % len(cores)]])
-    return cluster
-
-
-def raylets() -> set[psutil.Process]:
-    """Return the daemons of this process's nodes."""
-    return {one for one in psutil.Process().children(recursive=True) if one.name() == "raylet"}
-
-
 def measure_nodes(work: Path, settings: list[str], counts: list[int]) -> dict[str, Any]:
     """Measure the wall time of a study on some numbers of nodes, and simulate it."""
     options = [part for setting in settings for part in ("--set", setting)] + ["--shard-size", str(SHARD_SIZE)]
@@ -84,7 +63,7 @@ def measure_nodes(work: Path, settings: list[str], counts: list[int]) -> dict[st
         {"nodes": 0, "measured_s": alone, "simulated_s": simulated(options, speed, 1, ray=False)}
     ]
     for count in counts:
-        cluster = start_cluster(count, pinned=True)
+        cluster = SimulatedNodes(count, cpus=1, pinned=True)
         try:
             on_ray = ["--cpus-per-shard", "1", "--ray", cluster.address]
             measured = uavmec(["run", "table5", *options, "--out", str(work / f"nodes-{count}"), *on_ray])
@@ -139,7 +118,7 @@ def measure_stubs(folder: Path, shards: int) -> dict[str, Any]:
     from uavmec_jax.runs.status import run_status
     from uavmec_jax.studies.study import load_study
 
-    cluster = start_cluster(4, pinned=False)
+    cluster = SimulatedNodes(4, cpus=1)
     study = load_study("table5", {"axes.seeds": max(shards // 25, 1), "steps": 1000})
     plan = plan_run(study, shard_size=1)
     shutil.rmtree(folder, ignore_errors=True)

@@ -219,7 +219,7 @@ def prepare_environment(address: str) -> None:
         wanted = {_ON_NETWORK: "0", "RAY_AUTH_MODE": os.environ.get("RAY_AUTH_MODE", "token")}
         if wanted["RAY_AUTH_MODE"] == "token" and not _has_token():
             wanted["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
-        if "ray" in sys.modules and any(os.environ.get(name) != value for name, value in wanted.items()):
+        if sys.modules.get("ray") is not None and any(os.environ.get(name) != value for name, value in wanted.items()):
             raise StudyError("--ray local: Ray was imported before; start it with ray.init() first, or give an address")
         os.environ |= wanted
     if os.environ.get("RAY_AUTH_MODE") == "token" and not _has_token():

@@ -191,13 +191,18 @@ class TaskRun:
             position = task.position()
             failures.crashes = 1 if position != failures.position else failures.crashes + 1
             failures.position = position
+            why = f"{type(error).__name__}: {first_line(error)}{self._time_limit}"
             if failures.crashes >= _MAX_CRASHES:
-                return True, TaskError(
-                    f"its process died {failures.crashes} times in a row: {first_line(error)}", "", error
-                )
+                return True, TaskError(f"its process died {failures.crashes} times in a row: {why}", "", error)
             failures.not_before = time.monotonic() + min(0.5 * 2**failures.crashes, _MAX_BACKOFF_S)
-            self.on_event("lost", task=task.key, error=f"{type(error).__name__}: {first_line(error)}")
+            self.on_event("lost", task=task.key, error=why)
         return False, None
+
+    @property
+    def _time_limit(self) -> str:
+        """What may have ended a process, in words; Ray does not tell its exit code."""
+        limit = self.cluster.options.time_limit_s
+        return "" if limit is None else f" Attempts are ended after {limit:g} s (--time-limit)."
 
     def _cancel(self, references: list[Any]) -> None:
         """Cancel tasks, and wait until they have saved their work."""
