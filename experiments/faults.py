@@ -79,6 +79,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("results/faults"))
     parser.add_argument("--work", type=Path, default=Path("runs/faults"), help="folder of the runs")
     parser.add_argument("--faults", type=int, help="of each kind, for a test of the script")
+    parser.add_argument("--kinds", nargs="+", choices=PLAN, default=list(PLAN), help="which faults strike")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     work = arguments.work.absolute()
@@ -86,7 +87,7 @@ def main() -> None:
     (work / "faults.toml").write_text(STUDY)
     os.environ |= {"JAX_COMPILATION_CACHE_DIR": str(work / "cache"), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
     chance = random.Random(arguments.seed)
-    left = [kind for kind, count in PLAN.items() for _ in range(min(count, arguments.faults or count))]
+    left = [kind for kind in arguments.kinds for _ in range(min(PLAN[kind], arguments.faults or PLAN[kind]))]
     chance.shuffle(left)
     nodes = new_nodes()
     whole = Run(work / "whole", nodes, chance)

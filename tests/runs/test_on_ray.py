@@ -3,13 +3,15 @@
 import json
 import os
 import signal
+import threading
 import time
 
 import psutil
 import pytest
 
 from tests.clusters import CPUS, FORK, add_node, simulated_cluster
-from tests.runs.processes import TINY, bits, events, start, uavmec
+from tests.runs.processes import TINY, bits, events
+from uavmec_jax.agents.registry import ALGORITHMS
 from uavmec_jax.cluster.options import RayOptions
 from uavmec_jax.cluster.tasks import TaskError
 from uavmec_jax.errors import StudyError
@@ -26,7 +28,13 @@ pytestmark = [pytest.mark.ray, pytest.mark.filterwarnings(FORK)]
 ALL = parse_study(
     TINY,
     "tiny",
-    {"algorithm": "a2c", "axes.algorithm": ["dqn", "pqn", "ppo", "a2c"], "axes.powered": [8], "steps": 4096},
+    {
+        "algorithm": "a2c",
+        "axes.algorithm": sorted(ALGORITHMS),
+        "axes.powered": [8],
+        "steps": 131_072,
+        "evaluation.validate_every": 8192,
+    },
 )
 LONG = parse_study(TINY, "tiny", {"steps": 60_000})
 OFTEN = RunOptions(checkpoint_every_s=0.0, checkpoint_share=0.5)
@@ -49,8 +57,14 @@ def whole(tmp_path_factory):
     return directory
 
 
-def test_every_algorithm_has_the_bits_of_a_run_in_this_process(nodes, tmp_path):
-    here = run_study(ALL, tmp_path / "here", command="x", shard_size=2)
+@pytest.fixture(scope="module")
+def here(tmp_path_factory):
+    """A run of every algorithm in this process, and its results."""
+    directory = tmp_path_factory.mktemp("here") / "run"
+    return directory, run_study(ALL, directory, command="x", shard_size=2)
+
+
+def test_every_algorithm_has_the_bits_of_a_run_in_this_process(nodes, here, tmp_path):
     plans, seen = [], []
     there = run_study(
         ALL,
@@ -61,15 +75,71 @@ def test_every_algorithm_has_the_bits_of_a_run_in_this_process(nodes, tmp_path):
         on_plan=plans.append,
         on_progress=seen.append,
     )
-    assert bits(tmp_path / "there") == bits(tmp_path / "here")
-    assert (plans[0].agents, len(plans[0].shards)) == (8, 4)
+    directory, results = here
+    assert bits(tmp_path / "there") == bits(directory)
+    assert (plans[0].agents, len(plans[0].shards)) == (2 * len(ALGORITHMS), len(ALGORITHMS))
     assert seen[-1].steps == seen[-1].total_steps == there.run["environment_steps"]
-    assert here.run["environment_steps"] == there.run["environment_steps"]
+    assert results.run["environment_steps"] == there.run["environment_steps"]
     assert there.run["seconds"]["wall"] < sum(event["seconds"]["wall"] for event in events(tmp_path / "there", "done"))
     for event in events(tmp_path / "there", "chunk"):
         assert event["node"].count("/") == 1
         assert event["attempt"].startswith("01-")
     assert len({event["node"] for event in events(tmp_path / "there", "started")}) == 2
+
+
+def test_every_algorithm_keeps_its_bits_while_nodes_come_and_go(nodes, here, tmp_path):
+    """A third node joins; then the node of each algorithm's shard is killed in the middle of it, and another one joins."""
+    directory = tmp_path / "run"
+    add_node(nodes)
+    with Striker(nodes, directory, len(ALGORITHMS)) as striker:
+
+        def on_progress(_):
+            while striker.killed:
+                nodes.remove_node(striker.killed.pop(), allow_graceful=False)
+                add_node(nodes)
+
+        run_study(ALL, directory, command="x", shard_size=2, options=OFTEN, ray=on(nodes), on_progress=on_progress)
+    nodes.remove_node(next(iter(nodes.worker_nodes)), allow_graceful=False)
+    assert bits(directory) == bits(here[0])
+    assert striker.struck == set(range(len(ALGORITHMS)))
+    lost = events(directory, "lost")
+    assert {event["shard"] for event in lost} == striker.struck
+    assert all(event["attempt"][:2].isdigit() for event in lost)
+    assert any("node" in event for event in lost)
+    assert len({event["node"] for event in events(directory, "started")}) >= 3
+
+
+class Striker(threading.Thread):
+    """Kills the node of every shard once, as soon as the shard has a checkpoint."""
+
+    def __init__(self, nodes, directory, shards):
+        super().__init__()
+        self.nodes, self.directory, self.shards = nodes, directory, shards
+        self.struck, self.killed, self.ended = set(), [], False
+
+    def __enter__(self):
+        self.start()
+        return self
+
+    def __exit__(self, *_):
+        self.ended = True
+        self.join()
+
+    def run(self):
+        while len(self.struck) < self.shards and not self.ended:
+            victims = {}
+            for event in events(self.directory, "checkpoint"):
+                node = event["node"].split("/")[1]
+                alive = [one for one in self.nodes.worker_nodes if one.node_id.startswith(node)]
+                if event["shard"] not in self.struck and alive and alive[0] not in self.killed:
+                    victims[event["shard"]] = alive[0]
+            for victim in set(victims.values()):
+                raylet = psutil.Process(victim.all_processes["raylet"][0].process.pid)
+                for process in [*raylet.children(recursive=True), raylet]:  # a worker outlives its node by a second
+                    process.kill()
+                self.killed.append(victim)
+            self.struck |= set(victims)
+            time.sleep(0.02)
 
 
 def test_nothing_is_trained_on_ray_either(nodes, tmp_path):
@@ -159,49 +229,3 @@ def test_a_failed_task_is_a_failed_shard_unless_it_is_not_the_shards_fault(whole
 
 def interrupt(_):
     raise KeyboardInterrupt
-
-
-def test_the_command_starts_ray_is_stopped_and_killed_and_the_run_goes_on(whole, tmp_path):
-    """From the command line, with a Ray of its own each time: SIGTERM saves the shards, SIGKILL loses a little."""
-    (tmp_path / "tiny.toml").write_text(TINY)
-    options = ["--set", "steps=60000", "--shard-size", "2", "--checkpoint-every", "0", "--checkpoint-share", "0.5"]
-    process = start("run", "tiny.toml", *options, "--out", "run", "--ray", cwd=tmp_path)
-    wait_for(lambda: events(tmp_path / "run", "chunk"), process)
-    shown = json.loads(uavmec("status", "run", "--json", cwd=tmp_path).stdout)
-    assert list(shown["nodes"].values()) == [1]
-    assert shown["owner"].startswith(f"process {process.pid} on ")
-    process.send_signal(signal.SIGTERM)
-    _, errors = process.communicate(timeout=120)
-    assert process.returncode == 143, errors
-    assert "resume with: uavmec resume run" in errors
-    assert run_status(tmp_path / "run").shards["stopped"] == 1
-    process = start("resume", "run", "--ray", "local", cwd=tmp_path)
-    wait_for(lambda: len(events(tmp_path / "run", "started")) >= 2, process)
-    process.kill()
-    process.communicate()
-    wait_for_the_end_of_ray()
-    uavmec("resume", "run", cwd=tmp_path)
-    assert bits(tmp_path / "run") == bits(whole)
-
-
-def wait_for(condition, process, seconds=120):
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline, "took too long"
-        time.sleep(0.05)
-
-
-def wait_for_the_end_of_ray(seconds=60):
-    """Wait until no process of a killed driver works on: Ray ends them when it misses the driver."""
-    deadline = time.monotonic() + seconds
-    while any("attempt_shard" in " ".join(process.cmdline()) for process in psutil.process_iter() if _alive(process)):
-        assert time.monotonic() < deadline
-        time.sleep(0.2)
-
-
-def _alive(process):
-    try:
-        return process.status() != psutil.STATUS_ZOMBIE and process.cmdline()
-    except psutil.Error:
-        return False

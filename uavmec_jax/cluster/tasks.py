@@ -1,5 +1,6 @@
 """Fault-tolerant tasks on Ray: resubmitted without limit after node failures, a limited number of times after errors."""
 
+import logging
 import re
 import time
 import traceback
@@ -10,6 +11,8 @@ from typing import Any
 
 from uavmec_jax.cluster.connection import Cluster, first_line
 from uavmec_jax.errors import StudyError, UserError
+
+_LOGGER = logging.getLogger("uavmec_jax")
 
 _MAX_IN_FLIGHT = 1000
 """Tasks that are submitted at the same time: enough for any cluster to see what is waiting."""
@@ -73,6 +76,11 @@ class _Failures:
     """Time of the monotonic clock before which the task is not submitted again."""
 
 
+def _log_event(event: str, *, error: str, task: Any = None) -> None:
+    """Log an event as a warning."""
+    _LOGGER.warning("Ray: %s%s: %s", "" if task is None else f"shard {task} is ", event, error)
+
+
 @dataclass
 class TaskRun:
     """Runs tasks on a cluster.
@@ -81,13 +89,13 @@ class TaskRun:
         cluster: the cluster.
         on_wait: called several times a second while tasks run.
         on_event: called with ``(event, **facts)`` when a task is ``lost`` or ``retried``, or ``waiting`` for a node that can
-            take it.
+            take it; by default, that is a warning of the logger ``uavmec_jax``.
         grace_s: seconds that cancelled tasks have to save their work.
     """
 
     cluster: Cluster
     on_wait: Callable[[], None] = lambda: None
-    on_event: Callable[..., None] = lambda event, **facts: None
+    on_event: Callable[..., None] = _log_event
     grace_s: float = GRACE_S
     _answered: float = field(default_factory=time.monotonic)
     _asked: float = field(default_factory=time.monotonic)

@@ -13,8 +13,9 @@ from uavmec_jax.cluster.tasks import GRACE_S, ClusterLostError, Task, TaskError,
 from uavmec_jax.cluster.worker import node_name
 from uavmec_jax.errors import StudyError, UserError
 from uavmec_jax.files.locations import absolute, files_matching, to_path
+from uavmec_jax.files.reading import read_json_or_empty
 from uavmec_jax.runs.attempt import Attempt
-from uavmec_jax.runs.folder import CHECKPOINT, LOG, RunFolder
+from uavmec_jax.runs.folder import CHECKPOINT, LOG, PROGRESS, RunFolder
 from uavmec_jax.runs.in_process import OnProgress, not_written, record_failure
 from uavmec_jax.runs.log import RunLog
 from uavmec_jax.runs.run_plan import Shard
@@ -51,10 +52,11 @@ def run_on_ray(
     """
     open_shards = {s.number: s for s, state, _ in folder.states() if state not in ("done", "failed")}
     monitor, worker = _ProgressMonitor(folder, on_progress), WorkerOptions.of(cluster)
+    attempts: dict[int, str] = {}
 
     def task_of(shard: Shard) -> Task:
         def arguments() -> tuple[Any, ...]:
-            attempt = folder.new_attempt(shard)
+            attempts[shard.number] = attempt = folder.new_attempt(shard)
             return absolute(folder.path), folder.fingerprint, shard.number, attempt, worker
 
         def position() -> list[str]:
@@ -67,7 +69,8 @@ def run_on_ray(
         monitor.poll()
 
     def on_event(event: str, *, error: str, task: int | None = None) -> None:
-        log.event(event, **({} if task is None else {"shard": task}), error=error)
+        where = {} if task is None else _where(folder, open_shards[task], attempts[task])
+        log.event(event, **where, error=error)
 
     largest = max((partition.shard_bytes for partition in folder.plan.partitions.values()), default=0)
     run = TaskRun(cluster, on_wait, on_event, grace_s=GRACE_S + largest / _SAVED_PER_SECOND)
@@ -80,6 +83,13 @@ def run_on_ray(
         except ClusterLostError as error:
             raise StudyError(f"{error}; resume with: uavmec resume {folder.path}") from None
     monitor.poll(last=True)
+
+
+def _where(folder: RunFolder, shard: Shard, attempt: str) -> dict[str, Any]:
+    """Return shard, attempt and node of an attempt, as they stand in the log; the node only if the attempt began there."""
+    report = read_json_or_empty(folder.shard_folder(shard) / f"{PROGRESS}-{attempt}.json")
+    node = {"node": report["node"]} if "node" in report else {}
+    return {"shard": shard.number, "attempt": attempt} | node
 
 
 def _give_up(folder: RunFolder, shard: Shard, failed: TaskError, log: RunLog) -> None:
