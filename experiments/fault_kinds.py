@@ -63,7 +63,7 @@ class Run:
         if code not in (0, -signal.SIGKILL, 128 + signal.SIGTERM):
             *others, last = [line for line in errors.splitlines() if not line.startswith("[")]  # those are Ray's own
             assert code == 2 and not others, f"exit code {code}: {errors}"  # noqa: PT018
-            self.lines.append(last)
+            self.lines.append(last.replace(f"{self.folder.parent}/", ""))
         return code
 
     @property
