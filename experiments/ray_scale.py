@@ -87,8 +87,9 @@ def uavmec(arguments: list[str], core: int | None = None) -> float:
 
 def simulated(options: list[str], speed: float, devices: int, *, ray: bool) -> float:
     """Return the wall time that `--simulate` estimates."""
-    more = ["--simulate", "--speed", str(speed), "--devices", str(devices), "--json", "--cpus-per-shard", "1", "--ray"]
-    command = [sys.executable, "-m", "uavmec_jax", "run", "table5", *options, *(more if ray else more[:5])]
+    more = ["--simulate", "--speed", str(speed), "--devices", str(devices), "--json"]
+    more += ["--cpus-per-shard", "1", "--ray"] if ray else []
+    command = [sys.executable, "-m", "uavmec_jax", "run", "table5", *options, *more]
     pin = lambda: os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # noqa: E731
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, preexec_fn=pin)
     return round(float(json.loads(done.stdout)["wall_s"]), 1)
