@@ -43,15 +43,13 @@ def main() -> None:
     work = arguments.work.absolute()
     work.mkdir(parents=True)
     settings = [*SETTINGS, *([f"steps={arguments.steps}"] if arguments.steps else [])]
-    wall = measure_nodes(work, settings, arguments.nodes)
     stubs = measure_stubs(work / "stubs", arguments.shards)
+    print(stubs, flush=True)
+    wall = measure_nodes(work, settings, arguments.nodes)
     from uavmec_jax.training import host
 
     report = {"command": "uv run python experiments/ray_scale.py", "stubs": stubs, "study": wall, **host.describe()}
     write_report(arguments.out / "scale.json", report)
-    print(stubs)
-    for row in wall["nodes"]:
-        print(row)
 
 
 def measure_nodes(work: Path, settings: list[str], counts: list[int]) -> dict[str, Any]:
@@ -72,6 +70,7 @@ def measure_nodes(work: Path, settings: list[str], counts: list[int]) -> dict[st
         rows.append({"nodes": count, "measured_s": measured, "simulated_s": simulated(options, speed, count, ray=True)})
     for row in rows:
         row["error"] = round(row["simulated_s"] / row["measured_s"] - 1, 3)
+        print(row, flush=True)
     return {"settings": settings, "shard_size": SHARD_SIZE, "speed_of_one_core": speed, "nodes": rows}
 
 
@@ -100,7 +99,7 @@ def read_run(folder: Path) -> dict[str, Any]:
     return dict(json.loads((folder / "run.json").read_text()))
 
 
-def write_nothing(directory: str, number: int, attempt: str, worker: Any) -> None:
+def write_nothing(directory: str, fingerprint: str, number: int, attempt: str, worker: Any) -> None:
     """Write an empty result, in place of an attempt at a shard."""
     folder = Path(directory) / "shards" / f"{number:05d}"
     folder.mkdir(parents=True)
