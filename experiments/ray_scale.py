@@ -76,22 +76,29 @@ def measure_nodes(work: Path, settings: list[str], counts: list[int]) -> dict[st
 
 def uavmec(arguments: list[str], core: int | None = None) -> float:
     """Run a command, on one core if it is given, and return its wall time in seconds."""
-    pin = (lambda: os.sched_setaffinity(0, {core})) if core is not None else None
     started = time.perf_counter()
-    subprocess.run(
-        [sys.executable, "-m", "uavmec_jax", *arguments], check=True, stdout=subprocess.DEVNULL, preexec_fn=pin
-    )
+    run_pinned(arguments, core)
     return round(time.perf_counter() - started, 1)
+
+
+def run_pinned(arguments: list[str], core: int | None) -> str:
+    """Run a command, on one core if it is given, and return what it prints."""
+    command = [sys.executable, "-m", "uavmec_jax", *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        if core is not None:
+            psutil.Process(process.pid).cpu_affinity([core])  # before it has any threads
+        printed, _ = process.communicate()
+    if process.returncode != 0:
+        raise subprocess.CalledProcessError(process.returncode, command)
+    return printed
 
 
 def simulated(options: list[str], speed: float, devices: int, *, ray: bool) -> float:
     """Return the wall time that `--simulate` estimates."""
     more = ["--simulate", "--speed", str(speed), "--devices", str(devices), "--json"]
     more += ["--cpus-per-shard", "1", "--ray"] if ray else []
-    command = [sys.executable, "-m", "uavmec_jax", "run", "table5", *options, *more]
-    pin = lambda: os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # noqa: E731
-    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, preexec_fn=pin)
-    return round(float(json.loads(done.stdout)["wall_s"]), 1)
+    printed = run_pinned(["run", "table5", *options, *more], min(os.sched_getaffinity(0)))
+    return round(float(json.loads(printed)["wall_s"]), 1)
 
 
 def read_run(folder: Path) -> dict[str, Any]:
