@@ -26,7 +26,10 @@ _ANSWER_S = 10.0
 _QUIET = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # else Ray warns of a change to come
+    # Under `uv run`, Ray would copy the working folder to every node and run its workers by the same command there.
+    "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",
 }
+"""What Ray reads when it is imported; what the user has set stays."""
 
 
 _ON_NETWORK = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
