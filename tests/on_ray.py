@@ -16,7 +16,7 @@ def worker_of(task):
     """The process that works on a task, or ``None``; Ray names processes after their tasks."""
     for process in psutil.Process().children(recursive=True):
         try:
-            if process.cmdline()[:1] == [f"ray::{task}"]:
+            if process.cmdline()[:1] == [f"ray::shard-{task}"]:
                 return process
         except psutil.Error:
             continue

@@ -207,7 +207,7 @@ def test_a_run_that_was_stopped_on_ray_goes_on_without_and_the_other_way_round(n
 
 
 def test_other_code_on_the_nodes_is_named(nodes, tmp_path, monkeypatch):
-    monkeypatch.setattr("uavmec_jax.runs.on_ray.host.code_digest", lambda: "0123456789abcdef")
+    monkeypatch.setattr("uavmec_jax.training.host.code_digest", lambda: "0123456789abcdef")
     with pytest.raises(StudyError, match=r"has other code than the driver \(uavmec_jax's code 0123456789ab -> \w+\)"):
         run_study(LONG, tmp_path / "run", ray=on(nodes))
     assert not (tmp_path / "run").exists()

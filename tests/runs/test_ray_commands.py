@@ -75,7 +75,7 @@ def wait_for(condition, process, seconds=120):
 def wait_for_the_end_of_ray(seconds=60):
     """Wait until no process of a killed driver works on: Ray ends them when it misses the driver."""
     deadline = time.monotonic() + seconds
-    while any("attempt_shard" in " ".join(process.cmdline()) for process in psutil.process_iter() if _alive(process)):
+    while any("ray::shard-" in " ".join(process.cmdline()) for process in psutil.process_iter() if _alive(process)):
         assert time.monotonic() < deadline
         time.sleep(0.2)
 
