@@ -98,6 +98,7 @@ def _non_dominated(layout: Layout, states: State) -> Int[np.ndarray, " kept"]:
     criteria = np.concatenate([age, battery, energy, packs], axis=1)
     place = np.where(states.grounded[..., None], np.nan, states.uav_position).reshape(len(age), -1)
     _, group = np.unique(place, axis=0, return_inverse=True, equal_nan=True)
+    group = group.reshape(-1)  # NumPy 2.0 keeps an axis
     # Nothing dominates the first in this order.
     order = np.argsort(-np.sum(criteria / np.maximum(np.abs(criteria).max(axis=0), 1e-9), axis=1), kind="stable")
     kept: list[int] = []
