@@ -10,6 +10,8 @@ from click.testing import CliRunner
 from tests.cli.test_advise import HARBOUR
 from tests.runs.processes import TINY, plan_in
 from uavmec_jax.cli import main
+from uavmec_jax.cluster.options import RayOptions
+from uavmec_jax.errors import StudyError
 from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.study import parse_study
 
@@ -55,6 +57,11 @@ def test_simulate():
         (["resume", "."], "uavmec: .: holds no run that can be resumed (run_plan.json is missing)"),
         (["status", "nowhere"], "uavmec: nowhere: holds no run that can be resumed"),
         (["run", "table5", "--ray", "table6"], "uavmec: --ray table6: is not the address of a Ray cluster; give"),
+        (["resume", ".", "--retries", "2"], "uavmec: --cpus-per-shard, --gpus-per-shard, --resource, --retries and"),
+        (
+            ["run", "table5", "--resource", "fast", "--ray"],
+            "uavmec: --resource fast: give NAME=VALUE, e.g. --resource bigmem=1",
+        ),
         (["resume", ".", "--retries", "3"], "uavmec: --cpus-per-shard, --gpus-per-shard, --resource, --retries and"),
         (
             ["run", "table5", "--resource", "fast=no", "--ray"],
@@ -124,3 +131,9 @@ def test_a_missing_extra_is_named(tmp_path, monkeypatch, module, arguments, line
     assert done.exit_code == 2, done.output
     assert line in done.stderr
     assert not list(tmp_path.glob("runs/*"))
+
+
+@pytest.mark.parametrize("ray", [3, {"address": "host:6379"}, ["host:6379"]])
+def test_what_is_no_cluster_is_refused(ray):
+    with pytest.raises(StudyError, match=r"ray is .*; give True, an address or um\.RayOptions"):
+        RayOptions.of(ray)

@@ -206,6 +206,17 @@ def test_a_run_that_was_stopped_on_ray_goes_on_without_and_the_other_way_round(n
     assert bits(directory) == bits(whole)
 
 
+def test_a_resumed_run_has_the_cores_of_its_plan(nodes, tmp_path, monkeypatch):
+    """So as many shards run at the same time as before, without the options of before."""
+    directory, seen = tmp_path / "run", []
+    one = RayOptions(address=nodes.address, cpus_per_shard=1)
+    run_study(LONG, directory, shard_size=2, ray=one, on_progress=interrupt)
+    monkeypatch.setattr("uavmec_jax.runs.run.run_on_ray", lambda folder, cluster, *_: seen.append(cluster.requirements))
+    with pytest.raises(StudyError):
+        resume_run(directory, ray=nodes.address)
+    assert seen[0]["num_cpus"] == 1
+
+
 def test_other_code_on_the_nodes_is_named(nodes, tmp_path, monkeypatch):
     monkeypatch.setattr("uavmec_jax.training.host.code_digest", lambda: "0123456789abcdef")
     with pytest.raises(StudyError, match=r"has other code than the driver \(uavmec_jax's code 0123456789ab -> \w+\)"):

@@ -9,7 +9,7 @@ from typing import IO, Any
 
 import click
 
-_EXAMPLES = {"--set": "--set dqn.gamma=0.99"}
+_EXAMPLES = {"--set": "--set dqn.gamma=0.99", "--resource": "--resource bigmem=1"}
 
 
 class InputError(click.ClickException):

@@ -182,11 +182,11 @@ def ray_options(command: Callable) -> Callable:
             "RAY_ADDRESS, else on one that is started on this machine (local). Give it last, or with an address.",
         ),
         click.option(
-            "--cpus-per-shard", type=click.IntRange(1), help="With --ray: cores of a shard (default: this machine's)."
+            "--cpus-per-shard",
+            type=click.IntRange(1),
+            help="With --ray: cores of a shard (default: this machine's; of a run that is resumed, its plan's).",
         ),
-        click.option(
-            "--gpus-per-shard", type=click.IntRange(0), default=0, help="With --ray: GPUs of a shard (default: 0)."
-        ),
+        click.option("--gpus-per-shard", type=click.IntRange(0), help="With --ray: GPUs of a shard (default: 0)."),
         click.option(
             "--resource",
             "resources",
@@ -197,27 +197,26 @@ def ray_options(command: Callable) -> Callable:
         click.option(
             "--retries",
             type=click.IntRange(0),
-            default=default.retries,
             help="With --ray: how often a shard is retried after an application error; nodes that die do not count "
-            f" (default: {default.retries}).",
+            f"(default: {default.retries}).",
         ),
         click.option(
             "--time-limit",
             "time_limit_s",
             type=click.FloatRange(1),
-            help="With --ray: kill an attempt at a shard after this many seconds and retry it from its last checkpoint.",
+            help="With --ray: kill an attempt at a shard after this many seconds; the next one resumes where it can.",
         ),
     )
 
     def decorate(address: str | None, resources: tuple[str, ...], **others: Any) -> Any:
         names = ("cpus_per_shard", "gpus_per_shard", "retries", "time_limit_s")
-        needs = {name: others.pop(name) for name in names}
+        needs = {name: value for name in names if (value := others.pop(name)) is not None}
         amounts = dict(assignment(text, "--resource") for text in resources)
         for name, amount in amounts.items():
             if isinstance(amount, bool) or not isinstance(amount, int | float) or not amount > 0:
                 raise InputError(f"--resource {name}={amount}: the amount must be a positive number")
         ray = None if address is None else RayOptions(address=address or None, resources=amounts, **needs)
-        if ray is None and (amounts or needs != {name: getattr(default, name) for name in names}):
+        if ray is None and (amounts or needs):
             raise InputError("--cpus-per-shard, --gpus-per-shard, --resource, --retries and --time-limit need --ray")
         return command(ray=ray, **others)
 

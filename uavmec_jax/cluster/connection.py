@@ -170,7 +170,10 @@ def _init(ray: Any, address: str) -> None:
             raise StudyError(
                 f"--ray {address}: this machine is not a node of that cluster; run the command on a node, or give ray://HOST:10001"
             ) from None
-        raise StudyError(f"--ray {address}: cannot reach a Ray cluster at this address: {first_line(error)}") from None
+        hint = "; if the cluster asks for a token, set RAY_AUTH_MODE=token and RAY_AUTH_TOKEN"
+        raise StudyError(
+            f"--ray {address}: cannot reach a Ray cluster at this address: {first_line(error)}{hint}"
+        ) from None
 
 
 def _head(ray: Any) -> str:

@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
+from uavmec_jax.errors import StudyError
+
 LOCAL = "local"
 """The address that starts Ray on this machine."""
 
@@ -32,9 +34,15 @@ class RayOptions:
 
     @classmethod
     def of(cls, ray: "RayOptions | str | bool | None") -> "RayOptions | None":
-        """Return the options that a caller means: ``True`` for the defaults, an address, options, or none."""
+        """Return the options that a caller means: ``True`` for the defaults, an address, options, or none.
+
+        Raises:
+            StudyError: it is something else.
+        """
         if isinstance(ray, str):
             return cls(address=ray)
         if isinstance(ray, cls):
             return ray
-        return cls() if ray else None
+        if ray is None or isinstance(ray, bool):
+            return cls() if ray else None
+        raise StudyError(f"ray is {ray!r}; give True, an address or um.RayOptions(...)")

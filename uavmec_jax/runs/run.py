@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -120,7 +121,7 @@ def resume_run(
     Args:
         directory: folder of the run, a path or a URL.
         reward: the reward function that the run was started with, if any.
-        ray: as for :func:`run_study`.
+        ray: as for :func:`run_study`; by default, a shard has as many cores as its run plan says.
         take_over: resume although the folder names a process on another machine as its owner, which is dead.
         other_code: resume although code or libraries have changed since the run was planned; its label then says so.
         on_progress: called after every chunk.
@@ -139,6 +140,9 @@ def resume_run(
             return load_results(path)
         if ray and reward is not None:
             raise StudyError(f"{path}: a run on Ray takes no reward function")
+        if ray and not ray.cpus_per_shard and not ray.gpus_per_shard:  # a shard can use as many as the plan says
+            groups = max(partition.groups for partition in folder.plan.partitions.values())
+            ray = replace(ray, cpus_per_shard=groups)
         _check_location(path, ray)
         if not other_code:
             folder.check_code()
