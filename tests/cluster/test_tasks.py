@@ -52,8 +52,8 @@ def die(path, times):
 
 def wait_for(path, name):
     """Wait for a file, or for the end."""
-    (path / f"started-{name}").touch()
     try:
+        (path / f"started-{name}").touch()  # from here on it may be cancelled
         while not (path / "go").exists():
             time.sleep(0.05)
     except KeyboardInterrupt:
