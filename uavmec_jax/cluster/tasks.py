@@ -32,6 +32,9 @@ _LONELY_S = 5.0
 _SILENCE_S = 15.0
 """Seconds without an answer of the head after which the connection is lost. Ray itself ends the process after a minute."""
 
+_SETTLE_S = 2.0
+"""Seconds after its submission in which a task is not cancelled."""
+
 GRACE_S = 120.0
 """Seconds that cancelled tasks have to save their work."""
 
@@ -99,6 +102,7 @@ class TaskRun:
     grace_s: float = GRACE_S
     _answered: float = field(default_factory=time.monotonic)
     _asked: float = field(default_factory=time.monotonic)
+    _submitted: float = field(default_factory=time.monotonic)
     _told: bool = False
     _lost: bool = False
     _remote: dict[Callable[..., Any], Any] = field(default_factory=dict)
@@ -149,6 +153,7 @@ class TaskRun:
             decorate = self.cluster.ray.remote(num_gpus=gpus, max_calls=1) if gpus else self.cluster.ray.remote
             remote = self._remote[task.function] = decorate(task.function)
         options = {"max_retries": 0, "name": f"shard-{task.key}", **self.cluster.requirements}
+        self._submitted = time.monotonic()
         return remote.options(**options).remote(*task.arguments())
 
     def _finished(self, references: list[Any]) -> list[Any]:
@@ -213,12 +218,18 @@ class TaskRun:
         return "" if limit is None else f" Attempts are ended after {limit:g} s (--time-limit)."
 
     def _cancel(self, references: list[Any]) -> None:
-        """Cancel tasks, and wait until they have saved their work."""
+        """Cancel tasks, the latest first, and wait until they have saved their work.
+
+        Ray 2.60 ends this process where it cancels a task at the moment in which it hands it to a worker. So tasks that were
+        just submitted have a moment to get there, and no running one makes room while others still wait to be cancelled.
+        """
         ray, deadline = self.cluster.ray, time.monotonic() + self.grace_s
         if not references or self._lost or not ray.is_initialized():
             return
         try:
-            for reference in references:
+            settled = self._submitted + _SETTLE_S - time.monotonic()
+            references = ray.wait(references, num_returns=len(references), timeout=max(settled, 0.0))[1]
+            for reference in reversed(references):
                 ray.cancel(reference, force=False)
             while references and time.monotonic() < deadline:
                 references = ray.wait(references, num_returns=len(references), timeout=1.0)[1]
