@@ -49,9 +49,7 @@ def test_a_token_that_is_asked_for_and_missing_is_named(monkeypatch, tmp_path, m
 
 @pytest.mark.ray
 def test_a_local_ray_has_a_token_and_listens_on_the_loopback_interface_alone():
-    done = subprocess.run(
-        [sys.executable, "-c", START], capture_output=True, text=True, timeout=120, env=without_ray(environment())
-    )
+    done = started("RayOptions()")
     assert done.returncode == 0, done.stderr
     first, *ports = done.stdout.splitlines()
     assert first == "1 token 1"
@@ -61,21 +59,18 @@ def test_a_local_ray_has_a_token_and_listens_on_the_loopback_interface_alone():
 
 @pytest.mark.ray
 def test_what_this_machine_cannot_take_is_refused():
-    script = START.replace("RayOptions()", "RayOptions(cpus_per_shard=4096)")
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, timeout=120, env=without_ray(environment())
-    )
+    done = started("RayOptions(cpus_per_shard=4096)")
     assert "--ray local: this machine cannot take a shard, which needs CPU 4096 (largest node: 2)" in done.stderr
 
 
 @pytest.mark.ray
 def test_nobody_answers():
-    script = START.replace("RayOptions()", "RayOptions(address='127.0.0.1:1')")
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, timeout=120, env=without_ray(environment())
-    )
+    done = started("RayOptions(address='127.0.0.1:1')")
     assert "--ray 127.0.0.1:1: cannot reach a Ray cluster at this address" in done.stderr
 
 
-def without_ray(variables):
-    return {name: value for name, value in variables.items() if not name.startswith("RAY_")}
+def started(options):
+    """Start Ray with some options in a process of its own, in an environment that says nothing about Ray."""
+    variables = {name: value for name, value in environment().items() if not name.startswith("RAY_")}
+    command = [sys.executable, "-c", START.replace("RayOptions()", options)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, env=variables)

@@ -80,14 +80,7 @@ class Cluster:
 
     def answers(self) -> bool:
         """Return whether the head of the cluster can be reached."""
-        if not self.head:
-            return True
-        host, _, port = self.head.rpartition(":")
-        try:
-            socket.create_connection((host.strip("[]"), int(port)), timeout=_ANSWER_S).close()
-        except OSError:
-            return False
-        return True
+        return not self.head or _listens(*_host_and_port(self.head))
 
 
 def cpus_per_shard(options: RayOptions) -> int:
@@ -186,18 +179,26 @@ def _head(ray: Any) -> str:
 
 def _answers(address: str) -> bool:
     """Return whether something listens at an address; Ray itself would try for minutes."""
-    host, _, port = address.removeprefix("ray://").rpartition(":")
-    hosts = [host.strip("[]")]
-    if hosts[0] in ("localhost", "127.0.0.1", "::1"):  # for Ray, that is any address of this machine
+    host, port = _host_and_port(address.removeprefix("ray://"))
+    hosts = [host]
+    if host in ("localhost", "127.0.0.1", "::1"):  # for Ray, that is any address of this machine
         families = (socket.AF_INET, socket.AF_INET6)
         hosts += [one.address for some in psutil.net_if_addrs().values() for one in some if one.family in families]
-    for candidate in hosts:
-        try:
-            socket.create_connection((candidate, int(port)), timeout=_ANSWER_S).close()
-        except (OSError, OverflowError):
-            continue
-        return True
-    return False
+    return any(_listens(candidate, port) for candidate in hosts)
+
+
+def _host_and_port(address: str) -> tuple[str, int]:
+    host, _, port = address.rpartition(":")
+    return host.strip("[]"), int(port)
+
+
+def _listens(host: str, port: int) -> bool:
+    """Return whether something listens at a port."""
+    try:
+        socket.create_connection((host, port), timeout=_ANSWER_S).close()
+    except (OSError, OverflowError):
+        return False
+    return True
 
 
 def first_line(error: BaseException) -> str:

@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import psutil
 
+from uavmec_jax.cluster.connection import n_cores
 from uavmec_jax.errors import StudyError
 
 MEMORY_SHARE = 0.8
@@ -28,11 +29,10 @@ def use_all_cores(most: int | None = None) -> None:
     Args:
         most: use no more cores than this.
     """
-    n_cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
         return
     try:
-        jax.config.update("jax_num_cpu_devices", min(n_cores, most or n_cores))
+        jax.config.update("jax_num_cpu_devices", min(n_cores(), most or n_cores()))
     except RuntimeError:  # the backend is already running
         return
 
