@@ -1,7 +1,6 @@
 """Carry out the shards of a run on Ray: each attempt at a shard is a task on some node."""
 
 import time
-from collections import Counter
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -21,6 +20,7 @@ from uavmec_jax.runs.log import RunLog
 from uavmec_jax.runs.run_plan import Shard
 from uavmec_jax.runs.shard_runner import ShardRunner
 from uavmec_jax.runs.signals import StopSignal
+from uavmec_jax.runs.status import Tally
 from uavmec_jax.training.machine import WorkerOptions
 from uavmec_jax.training.population import Progress
 
@@ -113,21 +113,13 @@ class _ProgressMonitor:
         started = time.monotonic()
         if started < self._next and not last:
             return
-        plan, steps, closed, retries = self.folder.plan, 0, 0, 0
-        nodes: Counter[str] = Counter()
-        for shard, state, report in self.folder.states():
-            retries += max(report.get("attempts", 0) - 1, 0)
-            if state in ("done", "failed"):
-                steps += plan.work_of(shard)
-                closed += 1
-            else:
-                steps += int(report.get("steps", 0))
-            if state == "running":
-                nodes[str(report.get("node"))] += 1
+        tally = Tally.of(self.folder)
+        nodes, closed = tally.nodes, tally.shards["done"] + tally.shards["failed"]
         detail = ", ".join(f"{count} on {node}" for node, count in sorted(nodes.items())[:_NODES_SHOWN])
         detail += f" and {len(nodes) - _NODES_SHOWN} more nodes" * (len(nodes) > _NODES_SHOWN)
-        detail += f"; {retries} retries" * (retries > 0)
-        self.on_progress(Progress(max(closed - 1, 0), steps, plan.work, float("nan"), detail))
+        detail += f"; {tally.retries} retries" * (tally.retries > 0)
+        steps = tally.steps + tally.failed_steps
+        self.on_progress(Progress(max(closed - 1, 0), steps, self.folder.plan.work, float("nan"), detail))
         ended = time.monotonic()
         self._next = ended + max(_POLL_EVERY_S, (ended - started) / _POLL_SHARE)
 

@@ -1,7 +1,7 @@
 """The status of a run: shards, nodes, progress, speed, retries and time left, from its folder alone."""
 
 from collections import Counter
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +51,52 @@ class Status:
         return asdict(self)
 
 
+@dataclass
+class Tally:
+    """The states of all shards of a run, added up.
+
+    Attributes:
+        shards: state -> number of shards.
+        nodes: node -> number of shards that run there.
+        retries: attempts at shards beyond the first of each.
+        steps: work so far, without that of failed shards.
+        failed_steps: work that failed shards leave undone.
+        speed: training speed of all running shards together, steps per second.
+        running: the running shards, and the process that works on each.
+        failures: shard -> why it failed.
+    """
+
+    shards: Counter[str] = field(default_factory=lambda: Counter(waiting=0, running=0, stopped=0, failed=0, done=0))
+    nodes: Counter[str] = field(default_factory=Counter)
+    retries: int = 0
+    steps: int = 0
+    failed_steps: int = 0
+    speed: float = 0.0
+    running: list[str] = field(default_factory=list)
+    failures: dict[int, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, folder: RunFolder) -> "Tally":
+        """Add up the states of the shards of a run."""
+        tally, plan = cls(), folder.plan
+        for shard, state, report in folder.states():
+            tally.shards[state] += 1
+            tally.retries += max(report.get("attempts", 0) - 1, 0)
+            if state == "done":
+                tally.steps += plan.work_of(shard)
+            elif state == "failed":
+                tally.failed_steps += plan.work_of(shard)
+                tally.failures[shard.number] = str(report.get("error", "an unknown error"))
+            else:
+                tally.steps += int(report.get("steps", 0))
+            if state == "running":
+                tally.speed += float(report.get("speed", 0.0))
+                node = str(report.get("node", "an unknown node"))
+                tally.nodes[node] += 1
+                tally.running.append(f"shard {shard.number}: process {report.get('pid', '?')} on {node}")
+        return tally
+
+
 def run_status(directory: str | Path) -> Status:
     """Return the status of the run in a folder.
 
@@ -62,41 +108,23 @@ def run_status(directory: str | Path) -> Status:
 
 
 def _status_of(folder: RunFolder) -> Status:
-    plan = folder.plan
-    counts: Counter[str] = Counter(waiting=0, running=0, stopped=0, failed=0, done=0)
-    nodes: Counter[str] = Counter()
-    steps, retries, speed = 0, 0, 0.0
-    running, failures = [], {}
-    for shard, state, report in folder.states():
-        counts[state] += 1
-        retries += max(report.get("attempts", 0) - 1, 0)
-        if state == "done":
-            steps += plan.work_of(shard)
-        elif state == "failed":
-            failures[shard.number] = str(report.get("error", "an unknown error"))
-        else:
-            steps += int(report.get("steps", 0))
-        if state == "running":
-            speed += float(report.get("speed", 0.0))
-            node = str(report.get("node", "an unknown node"))
-            nodes[node] += 1
-            running.append(f"shard {shard.number}: process {report.get('pid', '?')} on {node}")
+    plan, tally = folder.plan, Tally.of(folder)
     owner = owner_of(folder.shards_folder)
     return Status(
         directory=str(folder.path),
         complete=folder.complete,
         owner=describe_process(owner) if owner else "",
         agents=plan.agents,
-        shards=dict(counts),
-        nodes=dict(nodes),
-        retries=retries,
-        steps=steps,
+        shards=dict(tally.shards),
+        nodes=dict(tally.nodes),
+        retries=tally.retries,
+        steps=tally.steps,
         total_steps=plan.work,
-        steps_per_second=speed,
-        seconds_left=(plan.work - steps) / speed if speed else None,
+        steps_per_second=tally.speed,
+        seconds_left=(plan.work - tally.steps) / tally.speed if tally.speed else None,
         disk_bytes=_size_of(folder.path),
-        running=running,
-        failures=failures,
+        running=tally.running,
+        failures=tally.failures,
     )
 
 
