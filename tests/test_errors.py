@@ -20,7 +20,10 @@ def test_a_message_is_one_line(text):
 
 
 def test_what_a_terminal_would_obey_is_escaped():
-    assert one_line("red \x1b[31m, back \x08, half \ud800, name Łódź") == r"red \x1b[31m, back \x08, half \ud800, name Łódź"
+    assert (
+        one_line("red \x1b[31m, back \x08, half \ud800, name Łódź")
+        == r"red \x1b[31m, back \x08, half \ud800, name Łódź"
+    )
 
 
 def test_escapes_count():

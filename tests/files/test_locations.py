@@ -121,7 +121,7 @@ def test_missing_and_damaged_files(place):
     make_folder(place)
     with pytest.raises(StudyError, match=r"x/a\.txt: cannot be read: No such file or directory$"):
         read_text(place / "a.txt", StudyError)
-    with pytest.raises(StudyError, match=r"x/a\.npz: cannot be read: .*No such file or directory: .*x/a\.npz"):
+    with pytest.raises(StudyError, match=r"x/a\.npz: cannot be read: No such file or directory$"):
         load_arrays(place / "a.npz")
     assert read_json_or_empty(place / "a.json") == {}
     write_text(place / "a.npz", "damaged")

@@ -6,7 +6,8 @@ from numpy.testing import assert_array_equal
 
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files.archives import load_arrays
-from uavmec_jax.files.reading import parse_toml, read_json_or_empty, read_text
+from uavmec_jax.files.parsing import parse_toml
+from uavmec_jax.files.reading import read_json_or_empty, read_text
 from uavmec_jax.files.writing import atomic, write_arrays, write_text
 
 
@@ -41,7 +42,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path):
     with pytest.raises(StudyError, match=r"x\.txt: cannot be read: No such file"):
         read_text(path, StudyError)
     path.write_bytes(b"\xff")
-    with pytest.raises(StudyError, match=r"x\.txt: cannot be read: .*utf-8"):
+    with pytest.raises(StudyError, match=r"x\.txt: cannot be read: byte 1 is not UTF-8; save the file as UTF-8"):
         read_text(path, StudyError)
     with pytest.raises(StudyError, match=r"x\.toml: not TOML: Invalid value"):
         parse_toml("a = ", "x.toml", StudyError)

@@ -18,7 +18,7 @@ from uavmec_jax.env.fleet import DepotKind, make_depots, make_fleet
 from uavmec_jax.env.layout import fleet_of, sample_layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.errors import ScenarioError
-from uavmec_jax.files.reading import parse_toml
+from uavmec_jax.files.parsing import parse_toml
 from uavmec_jax.scenarios.load import load_scenario
 from uavmec_jax.scenarios.named_scenario import make_named_scenario, name_scenario
 from uavmec_jax.scenarios.scenario_files import load_scenario_file, scenario_text

@@ -8,7 +8,7 @@ import pytest
 
 from tests.traffic.networks import osm_extract
 from uavmec_jax.errors import TrafficError
-from uavmec_jax.traffic import checked_xml
+from uavmec_jax.files import xml
 from uavmec_jax.traffic.checked_xml import checked_copy
 
 BOMB = """<?xml version="1.0"?><!DOCTYPE osm [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;">]><osm><note>&b;</note></osm>"""
@@ -97,7 +97,7 @@ def test_damaged_and_missing_files(tmp_path):
 
 
 def test_a_decompression_bomb_stops_at_the_limit(tmp_path, monkeypatch):
-    monkeypatch.setattr(checked_xml, "MAX_BYTES", 100_000)
+    monkeypatch.setattr(xml, "MAX_BYTES", 100_000)
     (tmp_path / "bomb.gz").write_bytes(gzip.compress(b"<osm>" + b" " * 10_000_000))
     with pytest.raises(TrafficError, match="is longer than"):
         checked_copy(tmp_path / "bomb.gz", tmp_path / "copy", "osm")

@@ -158,7 +158,8 @@ def _changes(
 ) -> dict[str, Any]:
     """Return the changes that the options make to a place, as tables of its file."""
     from uavmec_jax.errors import TrafficError
-    from uavmec_jax.files.reading import parse_toml, read_text
+    from uavmec_jax.files.parsing import parse_toml
+    from uavmec_jax.files.reading import read_text
 
     demand = {"origins": origins or None, "exits": dict(map(_exit, exits)) or None, "vehicles": vehicles}
     tables: dict[str, dict[str, Any]] = {"demand": demand, "simulation": {"seeds": seeds}}

@@ -43,10 +43,12 @@ def to_path(location: str | Path, error: type[UserError] = StudyError) -> Path:
     """Return a location as a path: a :class:`pathlib.Path`, or for a URL an object that can do the same.
 
     Raises:
-        UserError: for a URL, if universal-pathlib or the store's own package is not installed, the protocol is unknown,
-            or the URL was made a :class:`pathlib.Path`, which drops a slash; of the type ``error``.
+        UserError: it holds a NUL character; for a URL, if universal-pathlib or the store's own package is not installed, the
+            protocol is unknown, or the URL was made a :class:`pathlib.Path`, which drops a slash; of the type ``error``.
     """
     text = str(location)
+    if "\0" in text:
+        raise error(f"{text}: holds a NUL character, which no path can; give another path")
     if not is_url(text):
         if isinstance(location, Path) and _COLLAPSED_URL.match(text):
             raise error(f"{text}: looks like a URL that has lost a slash as a pathlib.Path; give it as text")

@@ -4,16 +4,34 @@ import dataclasses
 import difflib
 import math
 from collections.abc import Iterable, Sequence
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 import pydantic
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, create_model
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, create_model
+from pydantic_core import PydanticCustomError
+
+from uavmec_jax.errors import UserError
 
 from_array = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
 """Converts lists for fields that are tuples: TOML and JSON have arrays only, and strict models do not convert them."""
 
 Range = Annotated[tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]], from_array]
 """``[low, high]``."""
+
+
+def _check_printable(text: str) -> str:
+    if not text.isprintable():
+        raise PydanticCustomError("printable", "Input should be one line of characters that can be printed")
+    return text
+
+
+PrintableText = Annotated[str, Field(max_length=1000), AfterValidator(_check_printable)]
+"""One line of text without characters that a terminal would obey."""
+
+PrintableName = Annotated[str, Field(min_length=1, max_length=80), AfterValidator(_check_printable)]
+"""Name of a device, a UAV, a place."""
+
+_Model = TypeVar("_Model", bound=BaseModel)
 
 _BOUNDS = ("gt", "ge", "lt", "le")
 _TYPE_TAGS = ("int", "str", "float", "bool")
@@ -61,6 +79,20 @@ def _field(field: dataclasses.Field) -> Any:
     if "items" in field.metadata:  # a tuple of any length
         return Annotated[tuple[Annotated[int, Field(**field.metadata["items"])], ...], from_array], default
     return Range, default
+
+
+def validated(
+    model: type[_Model], data: Any, source: object, error: type[UserError], *, strict: bool | None = None
+) -> _Model:
+    """Return data from outside as a model; ``source`` names them in messages.
+
+    Raises:
+        UserError: a value is missing, unknown or not what it should be; of the type ``error``, one line.
+    """
+    try:
+        return model.model_validate(data, strict=strict)
+    except pydantic.ValidationError as problem:
+        raise error(describe_error(str(source), problem, model, data)) from None
 
 
 def suggest(word: str, options: Iterable[str]) -> str:

@@ -1,8 +1,9 @@
-"""Atomic writes: a file is replaced by a complete new one, or left as it was."""
+"""Atomic writes: a file is replaced by a complete new one, or left as it was, whoever else writes it at the same time."""
 
 import errno
 import os
 import secrets
+import stat
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -49,30 +50,63 @@ def create_exclusively(path: Path, content: bytes) -> bool:
 def _write(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:
     with atomic(path) as partial, partial.open("wb") as file:
         fill(file)
-        file.flush()
-        os.fsync(file.fileno())
 
 
 @contextmanager
 def atomic(path: Path) -> Iterator[Path]:
-    """Yield a temporary path of this machine, with the same suffix, for the caller to write.
+    """Yield a temporary file of this machine, empty and with the same suffix, for the caller to write.
 
-    On success the temporary file replaces ``path``. After an exception it is removed, and ``path`` is as before. Beside
-    a local ``path``; an object store gets the whole file at once, as one object.
+    On success the temporary file, flushed to the disk, replaces ``path``; a symbolic link there is replaced, not followed.
+    After an exception it is removed, and ``path`` is as before. Its name is random and it is created exclusively beside a
+    local ``path``, so that several writers do not meet; an object store gets the whole file at once, as one object.
+
+    Raises:
+        OSError: it cannot be written, or ``path`` is a folder, a pipe or a device file.
     """
     if is_local(path):
-        partial = path.with_name(f".{path.stem}-{secrets.token_hex(4)}.part{path.suffix}")
+        _check_replaceable(path)
+        partial = path.with_name(f".{path.stem[:100]}-{secrets.token_hex(8)}.part{path.suffix}")
+        os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))  # and so not through a link
         try:
             yield partial
+            _flush_to_disk(partial)
             partial.replace(path)
         finally:
             partial.unlink(missing_ok=True)
+        _flush_to_disk(path.parent)
         return
     with tempfile.TemporaryDirectory(prefix="uavmec-") as folder:
         partial = Path(folder) / path.name
         yield partial
         with store_errors():
             file_system(path).put_file(str(partial), path_in_store(path))
+
+
+def _check_replaceable(path: Path) -> None:
+    """Check that there is no file, or one that a new one may replace: not ``/dev/null``."""
+    try:
+        mode = os.lstat(path).st_mode
+    except FileNotFoundError:
+        return
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not (stat.S_ISREG(mode) or stat.S_ISLNK(mode)):
+        raise OSError(errno.EINVAL, "is not a regular file", str(path))
+
+
+def _flush_to_disk(path: Path) -> None:
+    """Wait until a file, or the names in a folder, would survive a loss of power; some file systems know no such thing."""
+    is_folder = path.is_dir()
+    if is_folder and os.name == "nt":
+        return
+    descriptor = os.open(path, os.O_RDONLY if is_folder or os.name != "nt" else os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    except OSError:
+        if not is_folder:
+            raise
+    finally:
+        os.close(descriptor)
 
 
 def set_aside(path: Path) -> None:

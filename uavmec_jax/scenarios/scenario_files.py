@@ -8,7 +8,8 @@ from typing import Any
 import tomli_w
 
 from uavmec_jax.errors import ScenarioError
-from uavmec_jax.files.reading import parse_toml, read_text
+from uavmec_jax.files.parsing import parse_toml
+from uavmec_jax.files.reading import read_text
 from uavmec_jax.scenarios.named_scenario import NamedScenario, make_named_scenario
 from uavmec_jax.scenarios.schema import Device
 

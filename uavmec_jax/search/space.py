@@ -14,7 +14,8 @@ from pydantic import Field
 from uavmec_jax.agents.registry import ALGORITHMS
 from uavmec_jax.env.rewards import REWARDS, TERMS
 from uavmec_jax.errors import StudyError
-from uavmec_jax.files.reading import parse_toml, read_text
+from uavmec_jax.files.parsing import parse_toml
+from uavmec_jax.files.reading import read_text
 from uavmec_jax.files.validation import StrictModel, describe_error, expectation, from_array, suggest
 from uavmec_jax.studies.population import seeds_of
 from uavmec_jax.studies.schema import Study

@@ -10,7 +10,8 @@ import tomli_w
 
 from uavmec_jax.agents.registry import ALGORITHMS
 from uavmec_jax.errors import StudyError
-from uavmec_jax.files.reading import parse_toml, read_text
+from uavmec_jax.files.parsing import parse_toml
+from uavmec_jax.files.reading import read_text
 from uavmec_jax.files.validation import describe_error, suggest
 from uavmec_jax.scenarios.settings import unused_params
 from uavmec_jax.studies.schema import Study

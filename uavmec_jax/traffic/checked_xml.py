@@ -4,25 +4,15 @@ SUMO's own readers silently accept negative speeds, unknown elements and include
 reaches them.
 """
 
-import bz2
-import gzip
 import math
-import zlib
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any
-from xml.sax import SAXParseException
-from xml.sax.handler import ContentHandler
-
-import defusedxml.sax
-from defusedxml import DefusedXmlException
+from typing import Any
 
 from uavmec_jax.errors import TrafficError
-
-MAX_BYTES = 4 * 2**30
-"""Longest file, decompressed: a compressed file of a few kilobytes can expand to any length."""
+from uavmec_jax.files.xml import CheckingHandler, RefusedError, copy_xml
 
 _ELEMENTS: Mapping[str, tuple[str, ...]] = {
     "osm": ("osm", "bounds", "note", "meta", "remark", "node", "way", "relation", "tag", "nd", "member"),
@@ -84,57 +74,12 @@ def checked_copy(source: Path, target: Path, kind: str) -> Contents:
         TrafficError: the file does not exist, is not XML, is truncated, too long or of another kind, declares a DTD or
             entities, or holds unknown elements or numbers out of range; one line.
     """
-    handler = _CheckingHandler(kind)
-    try:
-        with source.open("rb") as raw, target.open("wb") as copy:
-            defusedxml.sax.parse(_Tee(_decompress(raw), copy), handler, forbid_dtd=True)
-    except DefusedXmlException:
-        raise TrafficError(f"{source}: declares a DTD or entities, which are refused; export it without them") from None
-    except SAXParseException as error:
-        where = f"line {error.getLineNumber()}: {error.getMessage()}"
-        raise TrafficError(f"{source}: is not XML, or is truncated ({where})") from None
-    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-        raise TrafficError(f"{source}: is truncated or damaged: {error}") from None
-    except UnicodeError as error:
-        raise TrafficError(f"{source}: is not XML: {error}") from None
-    except _RefusedError as error:
-        raise TrafficError(f"{source}: {error}") from None
-    except OSError as error:
-        raise TrafficError(f"{source}: cannot be read: {error.strerror or error}") from None
+    handler = _Elements(kind)
+    copy_xml(source, target, handler, TrafficError)
     return handler.contents
 
 
-class _RefusedError(Exception):
-    """A file holds something that is not allowed."""
-
-
-def _decompress(raw: IO[bytes]) -> Any:
-    magic = raw.read(3)
-    raw.seek(0)
-    if magic[:2] == b"\x1f\x8b":
-        return gzip.GzipFile(fileobj=raw)
-    return bz2.BZ2File(raw) if magic == b"BZh" else raw
-
-
-class _Tee:
-    """A file whose contents are written to another file as they are read."""
-
-    def __init__(self, source: Any, copy: IO[bytes]):
-        self._source, self._copy, self._bytes = source, copy, 0
-
-    def read(self, size: int = -1) -> bytes:
-        chunk: bytes = self._source.read(size)
-        self._bytes += len(chunk)
-        if self._bytes > MAX_BYTES:
-            raise _RefusedError(f"is longer than {MAX_BYTES / 2**30:g} GiB; cut out the area that you need first")
-        self._copy.write(chunk)
-        return chunk
-
-    def close(self) -> None:
-        """Do nothing: :func:`checked_copy` closes the files that it opened."""
-
-
-class _CheckingHandler(ContentHandler):
+class _Elements(CheckingHandler):
     """Checks the root element, the names of the elements, and numbers."""
 
     def __init__(self, kind: str):
@@ -142,11 +87,12 @@ class _CheckingHandler(ContentHandler):
         self._kind = kind
         self.contents = Contents()
 
-    def startElement(self, name: str, attrs: Any) -> None:  # noqa: N802  (SAX's name)
+    def check(self, name: str, attrs: Any) -> None:
+        """Check the root element, the name of an element, and its numbers."""
         if not self.contents.counts:
             self._check_root(name)
         elif name not in _ELEMENTS[self._kind]:
-            raise _RefusedError(f"holds <{name}>, which is not an element of {_DESCRIPTIONS[self._kind]}")
+            raise RefusedError(f"holds <{name}>, which is not an element of {_DESCRIPTIONS[self._kind]}")
         self.contents.counts[name] += 1
         if self._kind == "osm":
             if name == "node":
@@ -158,9 +104,9 @@ class _CheckingHandler(ContentHandler):
 
     def _check_root(self, name: str) -> None:
         if name in _CONFIGURATIONS:
-            raise _RefusedError(f"is a SUMO configuration, which is never run; give {_DESCRIPTIONS[self._kind]}")
+            raise RefusedError(f"is a SUMO configuration, which is never run; give {_DESCRIPTIONS[self._kind]}")
         if name != self._kind:
-            raise _RefusedError(f"begins with <{name}>; {_DESCRIPTIONS[self._kind]} begins with <{self._kind}>")
+            raise RefusedError(f"begins with <{name}>; {_DESCRIPTIONS[self._kind]} begins with <{self._kind}>")
 
     def _check_number(self, name: str, attrs: Any, quantity: str) -> None:
         try:
@@ -171,13 +117,13 @@ class _CheckingHandler(ContentHandler):
             return  # SUMO writes -1 for "not given"
         if not 0 < value < 1e7:
             element = f"{name} {attrs['id']!r}" if "id" in attrs else f"a {name}"
-            raise _RefusedError(f"{quantity} of {element} is {attrs[quantity]!r}; it should be a number above 0")
+            raise RefusedError(f"{quantity} of {element} is {attrs[quantity]!r}; it should be a number above 0")
 
     def _add_node(self, attrs: Any) -> None:
         try:
             lon, lat = float(attrs["lon"]), float(attrs["lat"])
         except (KeyError, ValueError):
-            raise _RefusedError(f"node {attrs.get('id', '?')} has no lon and lat in degrees") from None
+            raise RefusedError(f"node {attrs.get('id', '?')} has no lon and lat in degrees") from None
         if not (abs(lon) <= 180 and abs(lat) <= 90):
-            raise _RefusedError(f"node {attrs.get('id', '?')} lies at lon {lon}, lat {lat}, which is not on the Earth")
+            raise RefusedError(f"node {attrs.get('id', '?')} lies at lon {lon}, lat {lat}, which is not on the Earth")
         self.contents.extend(lon, lat)

@@ -9,7 +9,8 @@ from pydantic import Field
 
 from uavmec_jax.env.params import MAX_DEVICES
 from uavmec_jax.errors import TrafficError
-from uavmec_jax.files.reading import parse_toml, read_text
+from uavmec_jax.files.parsing import parse_toml
+from uavmec_jax.files.reading import read_text
 from uavmec_jax.files.validation import StrictModel, describe_error, from_array, suggest
 
 _Positive = Annotated[float, Field(gt=0, le=1e7)]
