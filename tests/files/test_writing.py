@@ -1,10 +1,16 @@
 """Atomic writes and readers."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
 from uavmec_jax.errors import StudyError
+from uavmec_jax.files import writing
 from uavmec_jax.files.archives import load_arrays
 from uavmec_jax.files.parsing import parse_toml
 from uavmec_jax.files.reading import read_json_or_empty, read_text
@@ -55,3 +61,66 @@ def test_json_that_may_be_incomplete(tmp_path, content, result):
     if content is not None:
         path.write_text(content)
     assert read_json_or_empty(path) == result
+
+
+def test_a_planted_link_is_replaced_and_not_followed(tmp_path):
+    victim, path = tmp_path / "victim", tmp_path / "x.txt"
+    victim.write_text("precious")
+    path.symlink_to(victim)
+    write_text(path, "new")
+    assert victim.read_text() == "precious"
+    assert path.read_text() == "new"
+    assert not path.is_symlink()
+
+
+def test_a_temporary_name_that_is_taken_is_not_written_to(tmp_path, monkeypatch):
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+    monkeypatch.setattr(writing.secrets, "token_hex", lambda _: "guessed")
+    (tmp_path / ".x-guessed.part.txt").symlink_to(victim)
+    with pytest.raises(FileExistsError):
+        write_text(tmp_path / "x.txt", "new")
+    assert victim.read_text() == "precious"
+    assert not (tmp_path / "x.txt").exists()
+
+
+def test_a_device_file_is_not_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", Path("/dev/null")):
+        with pytest.raises(OSError, match="is not a regular file"):
+            write_text(path, "new")
+    with pytest.raises(IsADirectoryError):
+        write_text(tmp_path, "new")
+    assert Path("/dev/null").is_char_device()
+    assert os.listdir(tmp_path) == ["pipe"]
+
+
+def test_a_long_name_leaves_room_for_the_temporary_one(tmp_path):
+    path = tmp_path / ("x" * 251 + ".txt")
+    write_text(path, "new")
+    assert os.listdir(tmp_path) == [path.name]
+
+
+_WRITER = """
+import sys
+from pathlib import Path
+from uavmec_jax.files.writing import write_text
+path, letter = Path(sys.argv[1]), sys.argv[2]
+for _ in range(60):
+    write_text(path, letter * 300_000)
+"""
+
+
+@pytest.mark.slow
+def test_a_file_is_whole_under_two_writers_and_a_reader(tmp_path):
+    path = tmp_path / "x.txt"
+    writers = [subprocess.Popen([sys.executable, "-P", "-c", _WRITER, path, letter]) for letter in "ab"]
+    reads = 0
+    while any(writer.poll() is None for writer in writers):
+        if path.exists():
+            text = read_text(path, StudyError)
+            assert text in ("a" * 300_000, "b" * 300_000)
+            reads += 1
+    assert [writer.returncode for writer in writers] == [0, 0]
+    assert reads > 10
+    assert os.listdir(tmp_path) == ["x.txt"]

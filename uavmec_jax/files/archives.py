@@ -4,6 +4,7 @@ import hashlib
 import json
 import math
 import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -39,9 +40,24 @@ _KINDS = "biufU"
 
 _READ_ERRORS = (
     *(OSError, ValueError, EOFError, NotImplementedError, RuntimeError, MemoryError, OverflowError, TypeError),
-    *(SyntaxError, KeyError, AttributeError, IndexError, struct.error, zipfile.BadZipFile, zlib.error),
+    *(
+        SyntaxError,
+        KeyError,
+        AttributeError,
+        IndexError,
+        struct.error,
+        tokenize.TokenError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ),
 )
 """What zipfile, zlib and NumPy raise for damaged files, for files of another kind and for crafted ones."""
+
+_SAYS_NOTHING = (
+    *(UnicodeDecodeError, SyntaxError, KeyError, AttributeError, IndexError, TypeError),
+    *(struct.error, tokenize.TokenError),
+)
+"""Those whose text is about Python, not about the file."""
 
 _HEADER = "header"
 """Name of the archive's member that holds the header as JSON."""
@@ -131,7 +147,7 @@ def _reason(problem: Exception) -> str:
     """Return what went wrong in words."""
     if isinstance(problem, OSError):
         return reason_of(problem)
-    if isinstance(problem, UnicodeDecodeError | SyntaxError | KeyError | AttributeError | TypeError | struct.error):
+    if isinstance(problem, _SAYS_NOTHING):
         return f"it is damaged ({type(problem).__name__})"
     return str(problem) or type(problem).__name__
 

@@ -162,28 +162,25 @@ def _in_words(problem: ValueError) -> str:
     return f"a whole number has more than {MAX_DIGITS} digits" if too_long else str(problem)
 
 
-def _containers(data: Any) -> Iterator[list[Any]]:
-    """Yield what the tables and arrays of each level hold, from the outermost level inwards."""
+def _levels(data: Any) -> Iterator[list[Any]]:
+    """Yield the values of each level of tables and arrays, from the outermost level inwards."""
     level = [data]
     while level:
         yield level
-        level = [
-            part
-            for value in level
-            if isinstance(value, dict | list)
-            for part in (value.values() if isinstance(value, dict) else value)
-        ]
+        containers = (value for value in level if isinstance(value, dict | list))
+        level = [part for value in containers for part in (value.values() if isinstance(value, dict) else value)]
 
 
 def _depth_exceeds(data: Any, limit: int) -> bool:
     """Return whether tables and arrays are nested more than ``limit`` times."""
-    return any(depth > limit for depth, _ in enumerate(_containers(data)))
+    deepest = (level for depth, level in enumerate(_levels(data)) if depth >= limit)
+    return any(isinstance(value, dict | list) for level in deepest for value in level)
 
 
 def _check_whole_numbers(data: Any, source: object, error: type[UserError]) -> None:
     """Check that no whole number is too long to be shown."""
     limit = 10**MAX_DIGITS
-    for level in _containers(data):
+    for level in _levels(data):
         if any(isinstance(value, int) and abs(value) >= limit for value in level):
             raise error(f"{source}: holds a whole number of more than {MAX_DIGITS} digits")
 

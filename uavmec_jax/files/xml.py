@@ -22,6 +22,7 @@ MAX_EXPANSION = 60
 """Most bytes that a compressed byte may become, once ``FREE_BYTES`` are exceeded; maps reach 10 to 25."""
 
 FREE_BYTES = 16 * 2**20
+_BLOCK = 2**20
 
 MAX_DEPTH = 40
 """Deepest nesting of elements."""
@@ -46,6 +47,7 @@ def copy_xml(source: Path, target: Path, handler: "CheckingHandler", error: type
     """
     try:
         with open_regular(source) as raw, target.open("wb") as copy:
+            _check_length(raw)
             defusedxml.sax.parse(_Tee(raw, copy), handler, forbid_dtd=True)
     except DefusedXmlException:
         raise error(f"{source}: declares a DTD or entities, which are refused; export it without them") from None
@@ -91,6 +93,7 @@ class CheckingHandler(ContentHandler):
 
 
 def _decompress(raw: IO[bytes]) -> Any:
+    raw.seek(0)
     magic = raw.read(3)
     raw.seek(0)
     if magic[:2] == b"\x1f\x8b":
@@ -98,20 +101,25 @@ def _decompress(raw: IO[bytes]) -> Any:
     return bz2.BZ2File(raw) if magic == b"BZh" else raw
 
 
+def _check_length(raw: IO[bytes]) -> None:
+    """Check how long a file is when it is decompressed, before anything of it is parsed or copied."""
+    source, length = _decompress(raw), 0
+    while block := source.read(_BLOCK):
+        length += len(block)
+        if length > MAX_BYTES:
+            raise RefusedError(f"is longer than {size_in_words(MAX_BYTES)}; cut out the area that you need first")
+        if length > FREE_BYTES and length > MAX_EXPANSION * raw.tell():
+            raise RefusedError(f"expands to more than {MAX_EXPANSION} times its length; give it without compression")
+
+
 class _Tee:
     """A file whose contents are decompressed and written to another file as they are read."""
 
     def __init__(self, raw: IO[bytes], copy: IO[bytes]) -> None:
-        self._raw, self._copy, self._bytes = raw, copy, 0
-        self._source = _decompress(raw)
+        self._source, self._copy = _decompress(raw), copy
 
     def read(self, size: int = -1) -> bytes:
         chunk: bytes = self._source.read(size)
-        self._bytes += len(chunk)
-        if self._bytes > MAX_BYTES:
-            raise RefusedError(f"is longer than {size_in_words(MAX_BYTES)}; cut out the area that you need first")
-        if self._bytes > FREE_BYTES and self._bytes > MAX_EXPANSION * self._raw.tell():
-            raise RefusedError(f"expands to more than {MAX_EXPANSION} times its length; give it without compression")
         self._copy.write(chunk)
         return chunk
 
