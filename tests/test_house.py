@@ -73,6 +73,40 @@ def test_imports_inside_functions_are_listed():
     assert found == {module: set(imported) for module, imported in INSIDE_FUNCTIONS.items()}
 
 
+READERS = {
+    *("open", "read_text", "read_bytes", "read_csv", "read_json", "read_excel", "read_table", "fromfile", "loadtxt"),
+    *("genfromtxt", "memmap", "fdopen", "mmap"),
+}
+"""Functions and methods that open a file to read it, under any object's name."""
+
+PARSERS = {
+    *("np.load", "numpy.load", "json.load", "tomllib.load", "tomllib.loads", "pickle.load", "pickle.loads"),
+    *("csv.reader", "csv.DictReader", "zipfile.ZipFile", "gzip.open", "bz2.open", "lzma.open", "os.open", "io.open"),
+    *("ET.parse", "ElementTree.parse", "defusedxml.sax.parse"),
+}
+
+OPENS_ITS_OWN = {
+    "runs.log": {"path.open"},  # appends to its own log
+    "training.host": {"open", "file.read_bytes"},  # /proc/cpuinfo; the package's own source
+}
+"""Modules outside `files` that open files which nobody hands in -> how."""
+
+
+def test_only_the_room_files_reads_files():
+    found: dict[str, set[str]] = {}
+    for module, file in MODULES.items():
+        if room_of(module) == "files":
+            continue
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.Call) and _opens_a_file(name := ast.unparse(node.func)):
+                found.setdefault(module.removeprefix(f"{PACKAGE}."), set()).add(name)
+    assert found == OPENS_ITS_OWN
+
+
+def _opens_a_file(name: str) -> bool:
+    return (name.rpartition(".")[2] in READERS and "RunFolder" not in name) or name in PARSERS
+
+
 def test_the_picture_is_drawn(tmp_path):
     command = [sys.executable, SCRIPT, "--root", ROOT, "--out", tmp_path / "imports.png"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
