@@ -10,6 +10,7 @@ from . import training as training
 from ._version import __version__ as __version__
 from .agents.presets import DQN_BEST as DQN_BEST
 from .cluster.options import RayOptions as RayOptions
+from .env.checks import debug_checks as debug_checks
 from .env.dynamics import Cause as Cause
 from .env.dynamics import Outcome as Outcome
 from .env.dynamics import State as State
@@ -30,6 +31,7 @@ from .env.rollout import rollout as rollout
 from .env.rollout import rollouts as rollouts
 from .env.scenario import Scenario as Scenario
 from .env.scenario import make_scenario as make_scenario
+from .errors import ArgumentError as ArgumentError
 from .errors import UserError as UserError
 from .runs.results_folder import load_results as load_results
 from .runs.run import run_study as run_study

@@ -33,13 +33,22 @@ def test_one_value_for_all_or_one_for_each():
             lambda: make_depots(TWO_DEPOTS, pads=[1, 1, 1]),
             "pads has shape (3,); it should be (2,), or () for all alike",
         ),
-        (lambda: make_depots(TWO_DEPOTS, pads=0), "pads of depot 1 is 0; it should be at least 1"),
-        (lambda: make_depots([(0.0, float("nan"))]), "position of depot 1 is nan; it should be finite"),
-        (lambda: make_fleet(PARAMS, 0), "uavs is 0; give 1 to 100"),
-        (lambda: make_fleet(PARAMS, 2, battery_j=[1e6, 0]), "battery_j of UAV 2 is 0; it should be positive"),
-        (lambda: make_fleet(PARAMS, 2, flying_power_w=-1), "flying_power_w of UAV 1 is -1; it should be at least 0"),
+        (lambda: make_depots(TWO_DEPOTS, pads=0), "pads of depot 1 is 0; it should be a number of at least 1"),
+        (lambda: make_depots([(0.0, float("nan"))]), "position of depot 1 is nan; it should be a finite number"),
+        (lambda: make_fleet(PARAMS, 0), "uavs is 0; it should be a whole number from 1 to 100"),
+        (
+            lambda: make_fleet(PARAMS, 2, battery_j=[1e6, 0]),
+            "battery_j of UAV 2 is 0; it should be a finite number greater than 0",
+        ),
+        (
+            lambda: make_fleet(PARAMS, 2, flying_power_w=-1),
+            "flying_power_w of UAV 1 is -1; it should be a finite number from 0",
+        ),
         (lambda: make_fleet(PARAMS, 2, speed_m_s=[5.0]), "speed_m_s has shape (1,); it should be (2,), or () for all"),
-        (lambda: make_fleet(PARAMS, 1, start_m=[float("nan"), 0]), "start_m of UAV 1 is nan; it should be finite"),
+        (
+            lambda: make_fleet(PARAMS, 1, start_m=[float("nan"), 0]),
+            "start_m of UAV 1 is nan; it should be a finite number",
+        ),
         (lambda: make_fleet(PARAMS, 1, speed=5.0), "speed is not a field of a fleet; fields are speed_m_s, flying_po"),
     ],
 )

@@ -152,3 +152,28 @@ def test_fleets_are_refused_and_ages_have_no_limit_until_a_horizon():
         UavMecGymEnv(two)
     space = UavMecGymEnv(make_scenario(layout, params.replace(end="horizon"))).observation_space
     assert_array_equal(space.high, np.repeat([1.0, np.inf], 12).astype(np.float32))
+
+
+@pytest.mark.parametrize("action", [99, -1, 2.5, 12])
+def test_an_action_that_is_no_device_is_refused(env, action):
+    env.reset(seed=0)
+    with pytest.raises(um.ArgumentError, match=r"^action is .*; it should be a whole number from 0 to 11$"):
+        env.unwrapped.step(action)
+    vector = UavMecVectorEnv(2, env.unwrapped.scenario)
+    vector.reset(seed=0)
+    with pytest.raises(um.ArgumentError, match=r"^action of environment 2 is .*; it should|^action is array"):
+        vector.step(np.array([0, action]))
+    with pytest.raises(um.ArgumentError, match=r"^action is .*; it should be a whole number from 0 to 11$"):
+        FiveValueEnv().step(jax.random.key(0), um.initial_state(um.Params(), env.unwrapped.scenario.layout), action)
+
+
+def test_a_scenario_that_cannot_be_is_refused(env):
+    scenario = env.unwrapped.scenario
+    bad = scenario.replace(params=um.Params(uav_speed_m_s=-5.0))
+    for make in (UavMecGymEnv, lambda bad: UavMecVectorEnv(2, bad)):
+        with pytest.raises(
+            um.ArgumentError, match=r"^params\.uav_speed_m_s of entry 1 is -5|^params\.uav_speed_m_s is -5"
+        ):
+            make(bad)
+    with pytest.raises(um.ArgumentError, match=r"^num_envs is 0; it should be a whole number of at least 1$"):
+        UavMecVectorEnv(0)

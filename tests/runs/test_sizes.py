@@ -3,7 +3,7 @@
 import pytest
 
 from tests.runs.processes import TINY, plan_in
-from uavmec_jax.errors import StudyError
+from uavmec_jax.errors import ArgumentError, StudyError
 from uavmec_jax.runs import shard_runner
 from uavmec_jax.runs.checkpoints import interval_s
 from uavmec_jax.runs.run import run_study
@@ -33,6 +33,18 @@ def test_large_checkpoints_are_written_less_often():
     assert interval_s(60.0, 0.02, size=1e6) == 60.0
     assert interval_s(60.0, 0.02, size=1e6, cost_s=3.0) == pytest.approx(150.0)
     assert interval_s(0.0, 0.1, size=1.5e9) == pytest.approx(100.0)  # at 150 MB/s, before the first is timed
+
+
+@pytest.mark.parametrize("size", [-4, 0])
+def test_a_shard_size_that_cannot_be_is_refused_before_anything_is_written(tmp_path, size):
+    study = parse_study(TINY, "tiny")
+    for use in (
+        lambda: plan_run(study, shard_size=size),
+        lambda: run_study(study, tmp_path / "run", shard_size=size),
+    ):
+        with pytest.raises(ArgumentError, match=f"^shard_size is {size}; it should be a whole number of at least 1$"):
+            use()
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_population_beyond_all_memory_is_refused_with_an_estimate(tmp_path):

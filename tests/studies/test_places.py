@@ -1,17 +1,21 @@
 """Studies of places: positions, traffic and rewards; bad settings are refused in one line."""
 
 import chex
+import jax
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from tests.traffic.networks import evacuation
-from uavmec_jax.errors import StudyError, TrafficError
+from uavmec_jax.env.layout import sample_layout
+from uavmec_jax.env.params import Params
+from uavmec_jax.errors import ArgumentError, StudyError, TrafficError
 from uavmec_jax.reporting.tables import tables
 from uavmec_jax.runs.results_folder import load_results
 from uavmec_jax.runs.run import run_study
 from uavmec_jax.runs.run_plan import plan_run
 from uavmec_jax.scenarios.load import load_scenario
+from uavmec_jax.scenarios.places import on_place
 from uavmec_jax.scenarios.policies import load_policy
 from uavmec_jax.scenarios.seeds import held_out_draws
 from uavmec_jax.studies.population import cell_axes, make_agent_ids, make_agents
@@ -116,6 +120,12 @@ def test_traffic_without_a_place_is_refused():
     for name, value in (("traffic_bonus", 1.0), ("place_scale_m", 800.0), ("axes.traffic_penalty", [0.0, 1.0])):
         with pytest.raises(StudyError, match=f"{name.removeprefix('axes.')} is given, but no place"):
             parse_study(plain, "x", {name: value})
+
+
+def test_a_layout_of_another_size_than_the_place_is_refused():
+    layout = sample_layout(jax.random.key(0), Params(n_devices=5), 2, 2)
+    with pytest.raises(ArgumentError, match=r"^layout has 5 devices; albany has 12, give a layout of as many$"):
+        on_place(layout, load_evacuation("albany"))
 
 
 def test_random_scenario_in_a_place():

@@ -132,6 +132,11 @@ BAD = [
     ({"axes.powered": [4, 4]}, "bad.toml: axes.powered repeats a value"),
     ({"axes.powered": [[4]]}, "bad.toml: axes.powered has [4]; give whole numbers"),
     ({"steps": 3_000_000_000}, "bad.toml: steps is 3000000000; it should be less than or equal to 2000000000"),
+    (
+        {"steps": 2_000_000_000, "algorithm": "ppo", "ppo.batch_size": 8},
+        "bad.toml: ppo.n_epochs is 10; with batch_size = 8 and steps = 2,000,000,000, there are 2,500,001,280 updates; there "
+        "can be 2,147,483,647; lower n_epochs or steps, or raise batch_size",
+    ),
     ({"axes.powered": 8}, "bad.toml: axes.powered is 8; give a list"),
     ({"axes.seeds": 0}, "bad.toml: axes.seeds is 0; give at least 1 seed"),
     ({"axes.seeds": [-3]}, "bad.toml: axes.seeds has -3"),

@@ -69,6 +69,35 @@ def test_the_preset_is_the_study():
         ),
         ({"hyper": {"gamma": [0.9, 0.8]}}, r"hyper.gamma has shape \(2,\); give one number or 3 of them"),
         ({"settings": {"batchsize": 3}}, "settings has 'batchsize'; did you mean 'batch_size'"),
+        (
+            {"hyper": {"learning_rate": float("nan")}},
+            "hyper.learning_rate is nan; it should be a finite number greater than 0",
+        ),
+        (
+            {"hyper": {"learning_rate": [1e-3, 0.0, 1e-3]}},
+            "hyper.learning_rate of agent 2 is 0; it should be a finite number",
+        ),
+        ({"hyper": {"gamma": -3}}, "hyper.gamma is -3; it should be a finite number from 0 to 1"),
+        ({"settings": {"batch_size": 0}}, "settings: batch_size is 0; it should be greater than or equal to 1"),
+        ({"settings": {"hidden": (0,)}}, "settings: hidden.0 is 0; it should be greater than or equal to 1"),
+        ({"settings": {"double": "yes"}}, "settings: double is 'yes'; it should be a valid boolean"),
+        ({"steps": 0}, "steps is 0; it should be a whole number from 1 to 2000000000"),
+        ({"steps": 3 * 10**9}, "steps is 3000000000; it should be a whole number from 1 to 2000000000"),
+        (
+            {"validation": um.training.Validation(draws=0)},
+            r"validation\.draws is 0; it should be a whole number of at least 1",
+        ),
+        ({"validation": um.training.Validation(every=-1)}, r"validation\.every is -1; it should be a whole number"),
+        (
+            {"algorithm": "ppo", "steps": 2 * 10**9, "settings": {"batch_size": 8}},
+            "settings: n_epochs is 10; with batch_size = 8 and steps = 2,000,000,000, there are 2,500,001,280 updates; there "
+            "can be 2,147,483,647; lower n_epochs or steps, or raise batch_size",
+        ),
+        (
+            {"algorithm": "a2c", "settings": {"n_steps": 1_000_000, "n_envs": 4096}},
+            "settings: n_steps is 1000000; with n_envs = 4096, 1 iterations of 4,096,000,000 steps are 4,096,000,000; there "
+            "can be 2,147,483,647; lower n_steps, n_envs or steps",
+        ),
         ({"steps": 2 * 10**9, "settings": {"replay_capacity": 2 * 10**9}}, "steps is 2000000000: one agent needs"),
     ],
 )
@@ -76,6 +105,13 @@ def test_bad_arguments_are_refused(scenarios, changes, message):
     arguments = {"algorithm": "dqn", "key": jax.random.key(0), "steps": 100} | changes
     with pytest.raises(um.UserError, match=message):
         um.train(arguments.pop("algorithm"), scenarios, **arguments)
+
+
+def test_a_scenario_that_cannot_be_is_refused(scenarios):
+    layout = scenarios.layout
+    bad = scenarios.replace(layout=layout.replace(position=layout.position.at[1, 3].set(jnp.nan)))
+    with pytest.raises(um.ArgumentError, match=r"^layout\.position of entry 2, device 4 is nan; it should be a finite"):
+        um.train("dqn", bad, key=jax.random.key(0), steps=100)
 
 
 def test_one_scenario_is_not_a_batch(scenarios):

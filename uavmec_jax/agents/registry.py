@@ -9,6 +9,12 @@ from typing import Any
 from uavmec_jax.agents import a2c, dqn, ppo, pqn
 from uavmec_jax.agents.algorithm import Algorithm
 
+MAX_STEPS = 2_000_000_000
+"""Most environment steps of one agent: counters are 32-bit integers, and whole iterations may go beyond it."""
+
+_LAST = 2**31 - 1
+"""Largest number that the counters hold."""
+
 SCENARIO_SETTINGS = ("total_steps", "n_devices", "max_age")
 """Static settings that follow from the study and its scenarios, and are not set in files."""
 
@@ -70,7 +76,29 @@ class RegisteredAlgorithm:
             ValueError: settings contradict each other.
         """
         spec = self.spec_of(settings, total_steps=total_steps, n_devices=n_devices, max_age=max_age)
-        return dataclasses.replace(self.bind(spec), spec=spec)
+        algorithm = dataclasses.replace(self.bind(spec), spec=spec)
+        _check_counters(algorithm)
+        return algorithm
+
+
+def _check_counters(algorithm: Algorithm) -> None:
+    """Check that no counter of a training wraps: not that of the steps, nor the optimiser's of its updates.
+
+    Raises:
+        ValueError: one would; one line.
+    """
+    spec, per_iteration = algorithm.spec, algorithm.steps_per_iteration
+    if algorithm.total_steps > _LAST:
+        raise ValueError(
+            f"n_steps is {spec.n_steps}; with n_envs = {spec.n_envs}, {algorithm.iterations:,} iterations of "
+            f"{per_iteration:,} steps are {algorithm.total_steps:,}; there can be {_LAST:,}; lower n_steps, n_envs or steps"
+        )
+    updates = algorithm.iterations * getattr(spec, "n_epochs", 1) * getattr(spec, "minibatches", 1)
+    if updates > _LAST:
+        raise ValueError(
+            f"n_epochs is {spec.n_epochs}; with batch_size = {spec.batch_size} and steps = {spec.total_steps:,}, there are "
+            f"{updates:,} updates; there can be {_LAST:,}; lower n_epochs or steps, or raise batch_size"
+        )
 
 
 ALGORITHMS: Mapping[str, RegisteredAlgorithm] = MappingProxyType(

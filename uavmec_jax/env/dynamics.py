@@ -3,6 +3,7 @@
 import enum
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import chex
 import jax
@@ -10,10 +11,12 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
+from uavmec_jax.env.checks import LARGEST, POSITION, Bounds, Check, action_check, check_ranges, volumes_check
 from uavmec_jax.env.depots import can_help, serve_landed, stands_at
 from uavmec_jax.env.fleet import Fleet
 from uavmec_jax.env.layout import Layout, fleet_of
 from uavmec_jax.env.params import Params
+from uavmec_jax.env.scenario_checks import check_scenario
 from uavmec_jax.env.slot import Flights, Services, plan_flights, services_of, who_starts
 from uavmec_jax.env.types import Scalar
 
@@ -87,7 +90,18 @@ class Outcome:
 
 
 def initial_state(params: Params, layout: Layout) -> State:
-    """Return the state before the first slot: full batteries, fresh data, every UAV where it starts."""
+    """Return the state before the first slot: full batteries, fresh data, every UAV where it starts.
+
+    Raises:
+        ArgumentError: a parameter or a value of the layout is out of range; one line. Traced ones are not checked.
+    """
+    if not isinstance(layout.capacity, jax.core.Tracer):
+        check_scenario(params, layout)
+    return fresh_state(params, layout)
+
+
+def fresh_state(params: Params, layout: Layout) -> State:
+    """Return the state before the first slot, unchecked."""
     fleet = fleet_of(params, layout)
     state = State(
         battery=jnp.asarray(layout.capacity, jnp.float32),
@@ -145,7 +159,7 @@ def transition(
     params: Params,
     layout: Layout,
     state: State,
-    action: Int[ArrayLike, ""] | Int[Array, " K"],
+    action: Num[ArrayLike, ""] | Num[Array, " K"],
     volumes: Num[Array, " n"],
 ) -> tuple[State, Outcome]:
     """Let every UAV fly to a place, serve all devices in range, let the others compute, and check for failures.
@@ -155,15 +169,20 @@ def transition(
         layout: the devices, the UAVs and the depots, without batch axes (use ``vmap``).
         state: the state before the slot.
         action: the place that each UAV flies to: a device in ``[0, n)`` or a depot in ``[n, n + D)``; staying is allowed.
-            A scalar if there is one UAV. (Out of range is clamped.)
+            A scalar if there is one UAV. If it is traced, out of range is clamped.
         volumes: ``[n]`` bytes, each device's task in this slot.
 
     Returns:
         The state after the slot and its :class:`Outcome`. If no UAV's battery covers the slot and no depot helps, nothing
         happens in it, and the cause is :attr:`Cause.UAV`; under ``end = "horizon"`` it goes on without UAVs.
+
+    Raises:
+        ArgumentError: the action, a volume or an energy is out of range; one line. Traced ones are checked only inside
+            :func:`um.debug_checks`.
     """
     n = layout.n_devices
     chex.assert_shape([layout.capacity, state.battery, state.age, volumes], (n,))
+    _check_slot(layout, state, action, volumes)
     state, fleet = complete_state(layout, state), fleet_of(params, layout)
     living = living_devices(params, layout, state)
     target = jnp.atleast_1d(action)
@@ -187,6 +206,20 @@ def transition(
     unstarted = replace(state, slot=state.slot + jnp.where(params.count_unfinished_slot, 1, 0))
     after = jax.tree.map(lambda played, kept: jnp.where(happens, played, kept), after, unstarted)
     return after, _outcome(params, layout, state, after, happens, slot, drain, living)
+
+
+def _check_slot(layout: Layout, state: State, action: Any, volumes: Any) -> None:
+    """Check what goes into a slot."""
+    energy = Bounds(ge=0, le=LARGEST)
+    check_ranges(
+        [
+            action_check(action, layout.n_places),
+            volumes_check(volumes),
+            Check("state.battery", state.battery, energy, ("device",)),
+            Check("state.uav_energy", state.uav_energy, energy, ("UAV",)),
+            Check("state.uav_position", state.uav_position, POSITION, ("UAV", "")),
+        ]
+    )
 
 
 def _helped(layout: Layout, state: State) -> Bool[Array, ""]:

@@ -2,18 +2,43 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, wraps
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
-from uavmec_jax.env.dynamics import Cause, State, initial_state
+from uavmec_jax.env.checks import check_action, settled
+from uavmec_jax.env.dynamics import Cause, State, fresh_state
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.observation import observe
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.scenario import Scenario, advance, auto_reset, draw_volumes, is_truncated, make_scenario
+from uavmec_jax.env.scenario_checks import check_scenario
+
+
+def _checks_scenario(reset: Callable) -> Callable:
+    """Return ``reset``, a compiled method, behind a check of the scenario."""
+
+    @wraps(reset)
+    def checked(self: "UavMecEnv", key: PRNGKeyArray, params: Scenario | None = None) -> Any:
+        if params is not None and not isinstance(params.layout.capacity, jax.core.Tracer):
+            check_scenario(params.params, params.layout)
+        return settled(reset(self, key, params))
+
+    return checked
+
+
+def _checks_action(step: Callable) -> Callable:
+    """Return ``step``, a compiled method, behind a check of the action."""
+
+    @wraps(step)
+    def checked(self: "UavMecEnv", key: Any, state: State, action: Any, params: Scenario | None = None) -> Any:
+        check_action(action, Params().n_devices if params is None else params.layout.n_places)
+        return settled(step(self, key, state, action, params))
+
+    return checked
 
 
 @dataclass(frozen=True)
@@ -48,19 +73,25 @@ class UavMecEnv:
 
     def observation_shape(self, params: Scenario) -> Any:
         """Return the shape of an observation, or, if it is a pytree, the tree of its leaves' shapes."""
-        state = jax.eval_shape(initial_state, params.params, params.layout)
+        state = jax.eval_shape(fresh_state, params.params, params.layout)
         return jax.tree.map(
             lambda leaf: leaf.shape, jax.eval_shape(self.observation_fn, params.params, params.layout, state)
         )
 
+    @_checks_scenario
     @partial(jax.jit, static_argnames=("self",))
     def reset(self, key: PRNGKeyArray, params: Scenario | None = None) -> tuple[Any, State]:
-        """Start an episode and return its observation and state. Nothing is drawn here: volumes are drawn in each slot."""
+        """Start an episode and return its observation and state. Nothing is drawn here: volumes are drawn in each slot.
+
+        Raises:
+            ArgumentError: a value of the scenario is out of range; one line. Traced values are not checked.
+        """
         del key
         scenario = self.default_params if params is None else params
-        state = initial_state(scenario.params, scenario.layout)
+        state = fresh_state(scenario.params, scenario.layout)
         return self._observe(scenario, state), state
 
+    @_checks_action
     @partial(jax.jit, static_argnames=("self",))
     def step(
         self, key: PRNGKeyArray, state: State, action: Int[ArrayLike, ""], params: Scenario | None = None
@@ -70,6 +101,9 @@ class UavMecEnv:
         Returns:
             ``(observation, state, reward, terminated, truncated, info)``; ``info`` holds ``terminated``, ``truncated``,
             ``final_observation``, the fields of :class:`Outcome` and ``length``, the slots of the episode so far.
+
+        Raises:
+            ArgumentError: the action is out of range; one line. A traced action is clamped, see :func:`um.debug_checks`.
         """
         scenario = self.default_params if params is None else params
         layout = scenario.layout

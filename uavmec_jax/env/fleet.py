@@ -2,16 +2,17 @@
 
 import enum
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from uavmec_jax.env.checks import LARGEST, POSITION, Bounds, Check, check_range, check_ranges
 from uavmec_jax.env.params import Params
+from uavmec_jax.errors import ArgumentError
 
 MAX_UAVS = 100
 """Largest number of UAVs in a scenario."""
@@ -75,12 +76,12 @@ UAV_FIELDS = ("speed_m_s", "flying_power_w", "hovering_power_w", "battery_j", "s
 """Fields of a :class:`Fleet` whose defaults are the parameters of the same name prefixed with ``uav_``."""
 
 
-_Range = tuple[str, Callable[[float], bool]]  # in words, and whether a number is in it
+_POSITIVE, _NOT_NEGATIVE = Bounds(gt=0, le=LARGEST), Bounds(ge=0, le=LARGEST)
+FLEET_BOUNDS = dict.fromkeys(UAV_FIELDS, _POSITIVE) | {"flying_power_w": _NOT_NEGATIVE}
+"""Ranges of the fields of a :class:`Fleet`."""
 
-_FINITE: _Range = ("finite", math.isfinite)
-_POSITIVE: _Range = ("positive", lambda value: value > 0)
-_AT_LEAST_0: _Range = ("at least 0", lambda value: value >= 0)
-_AT_LEAST_1: _Range = ("at least 1", lambda value: value >= 1)
+DEPOT_BOUNDS = {"pads": Bounds(ge=1, infinite=True), "packs": Bounds(ge=0, infinite=True), "power_w": _NOT_NEGATIVE}
+"""Ranges of the fields of :class:`Depots`; padding has no pads."""
 
 
 def make_fleet(params: Params, uavs: int, depots: Depots | None = None, **values: ArrayLike | Sequence) -> Fleet:
@@ -93,11 +94,10 @@ def make_fleet(params: Params, uavs: int, depots: Depots | None = None, **values
         values: fields of :class:`Fleet`, a number for all UAVs or one per UAV; e.g. ``battery_j=[1.6e6, 0.8e6]``.
 
     Raises:
-        ValueError: a number is out of range, or there are too few or too many, one line that names the field.
+        ArgumentError: a number is out of range, or there are too few or too many, one line that names the field.
         TypeError: a name is not that of a field.
     """
-    if not 1 <= uavs <= MAX_UAVS:
-        raise ValueError(f"uavs is {uavs}; give 1 to {MAX_UAVS}")
+    check_range("uavs", uavs, ge=1, le=MAX_UAVS, whole=True)
     start = default_start(uavs, depots) if (given := values.pop("start_m", None)) is None else given
     present = values.pop("present", None)
     defaults: dict[str, Any] = {name: getattr(params, f"uav_{name}") for name in UAV_FIELDS}
@@ -105,10 +105,9 @@ def make_fleet(params: Params, uavs: int, depots: Depots | None = None, **values
         names = ", ".join((*UAV_FIELDS, "start_m", "present"))
         raise TypeError(f"{sorted(unknown)[0]} is not a field of a fleet; fields are {names}")
     fields = {name: _one_each(name, value, (uavs,)) for name, value in (defaults | values).items()}
-    for name, value in fields.items():
-        _check(name, value, "UAV", *(_AT_LEAST_0 if name == "flying_power_w" else _POSITIVE))
     start = _one_each("start_m", start, (uavs, 2))
-    _check("start_m", start, "UAV", *_FINITE)
+    checks = [Check(name, value, FLEET_BOUNDS[name], ("UAV",)) for name, value in fields.items()]
+    check_ranges([*checks, Check("start_m", start, POSITION, ("UAV", ""))])
     return Fleet(
         **fields,
         start_m=start,
@@ -133,26 +132,24 @@ def make_depots(
         power_w: charging power per UAV, W.
 
     Raises:
-        ValueError: a kind is unknown, a number is out of range, or there are too few or too many, one line that names the
+        ArgumentError: a kind is unknown, a number is out of range, or there are too few or too many, one line that names the
             field.
     """
     position = jnp.asarray(position, jnp.float32).reshape(-1, 2)
     count = position.shape[0]
     kinds = [kind] * count if isinstance(kind, str) else list(kind)
     if len(kinds) != count:
-        raise ValueError(f"kind has {len(kinds)} values; give one for all or {count}, one per depot")
+        raise ArgumentError(f"kind has {len(kinds)} values; give one for all or {count}, one per depot")
     names = [member.name.lower() for member in DepotKind]
     for number, name in enumerate(kinds, 1):
         if name not in names:
-            raise ValueError(f"kind of depot {number} is {name!r}; give {' or '.join(map(repr, names))}")
+            raise ArgumentError(f"kind of depot {number} is {name!r}; give {' or '.join(map(repr, names))}")
     numbers = {
         name: _one_each(name, value, (count,))
         for name, value in (("pads", pads), ("packs", packs), ("power_w", power_w))
     }
-    _check("position", position, "depot", *_FINITE)
-    _check("pads", numbers["pads"], "depot", *_AT_LEAST_1)
-    for name in ("packs", "power_w"):
-        _check(name, numbers[name], "depot", *_AT_LEAST_0)
+    checks = [Check(name, value, DEPOT_BOUNDS[name], ("depot",)) for name, value in numbers.items()]
+    check_ranges([Check("position", position, POSITION, ("depot", "")), *checks])
     return Depots(position=position, kind=jnp.asarray([names.index(name) for name in kinds], jnp.int32), **numbers)
 
 
@@ -165,17 +162,8 @@ def default_start(uavs: int, depots: Depots | None) -> Float[Array, "K 2"]:
 
 def _one_each(name: str, value: Any, shape: tuple[int, ...], dtype: Any = jnp.float32) -> Array:
     """Return one value for each UAV or depot, given one for all or one for each."""
-    array = jnp.asarray(value, dtype)
+    with np.errstate(over="ignore"):  # what is too large becomes infinite, which is refused
+        array = jnp.asarray(value, dtype)
     if array.shape not in (shape, shape[1:]):
-        raise ValueError(f"{name} has shape {array.shape}; it should be {shape}, or {shape[1:]} for all alike")
+        raise ArgumentError(f"{name} has shape {array.shape}; it should be {shape}, or {shape[1:]} for all alike")
     return jnp.broadcast_to(array, shape)
-
-
-def _check(name: str, values: Array, what: str, expected: str, fits: Callable[[float], bool]) -> None:
-    """Check the values of each UAV or depot that are known; traced ones are the caller's responsibility."""
-    if isinstance(values, jax.core.Tracer):
-        return
-    for number, row in enumerate(np.asarray(values), 1):
-        for value in np.ravel(row).tolist():
-            if math.isnan(value) or not fits(value):
-                raise ValueError(f"{name} of {what} {number} is {value:g}; it should be {expected}")

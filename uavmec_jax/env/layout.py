@@ -10,8 +10,9 @@ from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num, PRNGKeyArray
 
 from uavmec_jax.env import hardware
+from uavmec_jax.env.checks import CAPACITY, LARGEST, POSITION, Bounds, Check, check_bool, check_ranges
 from uavmec_jax.env.fleet import UAV_FIELDS, Depots, Fleet, default_start
-from uavmec_jax.env.params import Params
+from uavmec_jax.env.params import Params, check_params
 from uavmec_jax.env.types import Scalar
 
 
@@ -135,6 +136,17 @@ def fleet_of(params: Params, layout: Layout) -> Fleet:
     return Fleet(**fields, start_m=default_start(1, layout.depots))
 
 
+DEVICE_BOUNDS = {
+    "device_type": Bounds(ge=0, le=len(hardware.DEVICE_TYPES) - 1, whole=True),
+    "task": Bounds(ge=0, le=len(hardware.TASKS) - 1, whole=True),
+    "capacity": CAPACITY,
+    "standby_power": Bounds(ge=0, le=LARGEST),
+    "active_power": Bounds(ge=0, le=LARGEST),
+    "processing_rate": Bounds(gt=0, infinite=True),
+}
+"""Ranges of the numbers of each device in a :class:`Layout`, padding included."""
+
+
 def make_layout(
     position: Float[Array, "n 2"],
     device_type: Int[Array, " n"],
@@ -143,9 +155,18 @@ def make_layout(
     has_power: Bool[Array, " n"],
     has_comms: Bool[Array, " n"],
 ) -> Layout:
-    """Return a :class:`Layout` of the given devices, with powers and rates looked up by type and task (Tables 1-3)."""
+    """Return a :class:`Layout` of the given devices, with powers and rates looked up by type and task (Tables 1-3).
+
+    Raises:
+        ArgumentError: a number is out of range; the line names it and the device. Traced types and tasks are clamped.
+    """
     chex.assert_shape([device_type, task, capacity, has_power, has_comms], (position.shape[0],))
     chex.assert_shape(position, (None, 2))
+    given = {"device_type": device_type, "task": task, "capacity": capacity}
+    checks = [Check(name, value, DEVICE_BOUNDS[name], ("device",)) for name, value in given.items()]
+    check_ranges([Check("position", position, POSITION, ("device", "")), *checks])
+    check_bool("has_power", has_power)
+    check_bool("has_comms", has_comms)
     return Layout(
         position=position,
         device_type=device_type,
@@ -160,7 +181,7 @@ def make_layout(
 
 
 def sample_layout(
-    key: PRNGKeyArray, params: Params, n_powered: Int[ArrayLike, ""], n_connected: Int[ArrayLike, ""]
+    key: PRNGKeyArray, params: Params, n_powered: Num[ArrayLike, ""], n_connected: Num[ArrayLike, ""]
 ) -> Layout:
     """Draw a random layout (paper, section 3.1).
 
@@ -172,11 +193,17 @@ def sample_layout(
     Args:
         key: typed PRNG key.
         params: simulation parameters; ``n_devices`` fixes the shapes.
-        n_powered: number of devices with power, in ``[0, n]``; may be traced.
-        n_connected: number of devices with communication, in ``[0, n]``; may be traced.
+        n_powered: number of devices with power, in ``[0, n]``; may be traced, and then counts as 0 below and as n above.
+        n_connected: number of devices with communication, likewise.
+
+    Raises:
+        ArgumentError: a count or a parameter is out of range; one line.
     """
     chex.assert_rank([n_powered, n_connected], 0)
     n = params.n_devices
+    check_params(params)
+    counts = Bounds(ge=0, le=n, whole=True)
+    check_ranges([Check("n_powered", n_powered, counts), Check("n_connected", n_connected, counts)])
     k_position, k_type, k_task, k_capacity, k_power, k_comms = jax.random.split(key, 6)
     low, high = params.device_battery_range_j
     region = jnp.stack([jnp.asarray(side, jnp.float32) for side in params.region_m])

@@ -1,13 +1,17 @@
 """Simulation parameters: those of Table 1 that all devices share, and switches for what the paper leaves open."""
 
+import dataclasses
 import math
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
+from uavmec_jax.env.checks import CAPACITY, LARGEST, POSITION, Bounds, Check, check_range, check_ranges, is_traced
 from uavmec_jax.env.types import Range, Scalar
+from uavmec_jax.errors import ArgumentError
 
 MAX_DEVICES = 1000
 """Largest number of devices in a scenario."""
@@ -79,3 +83,40 @@ class Params:
 def leaf_dtype(default: bool | int | float) -> Any:
     """Return the dtype of a traced leaf whose default is a Python number: bool, int32 or float32."""
     return {bool: jnp.bool_, int: jnp.int32}.get(type(default), jnp.float32)
+
+
+_STATIC = ("n_devices", "end")
+_BOUNDS = {
+    field.name: Bounds.of(field, LARGEST) for field in dataclasses.fields(Params) if field.name not in _STATIC
+} | {
+    "device_battery_range_j": CAPACITY,
+    "region_m": Bounds(gt=0, le=POSITION.le),
+}
+_RISING = ("device_battery_range_j", "task_volume_range_bytes")
+
+
+def check_params(params: Params, name: str = "params") -> None:
+    """Check every parameter that is known, of one scenario or of a batch.
+
+    Raises:
+        ArgumentError: one line that names the parameter. Traced ones pass, see :func:`um.debug_checks`.
+    """
+    check_range(f"{name}.n_devices", params.n_devices, ge=1, le=MAX_DEVICES, whole=True)
+    if params.end not in ENDS:
+        raise ArgumentError(f"{name}.end is {params.end!r}; it should be {' or '.join(map(repr, ENDS))}")
+    checks = []
+    for field, bounds in _BOUNDS.items():
+        value = getattr(params, field)
+        if type(value) is float and bounds.admits(value):  # most of them; the rest takes longer
+            continue
+        if isinstance(value, tuple | list):  # (low, high)
+            if len(value) != 2:
+                raise ArgumentError(f"{name}.{field} is {value!r}; it should be two numbers")
+            checks += [Check(f"{name}.{field} (value {k})", number, bounds) for k, number in enumerate(value, 1)]
+        else:
+            checks.append(Check(f"{name}.{field}", value, bounds))
+    check_ranges(checks)
+    for field in _RISING:
+        low, high = getattr(params, field)
+        if not is_traced((low, high)) and np.any(np.asarray(low) > np.asarray(high)):
+            raise ArgumentError(f"{name}.{field} is ({low}, {high}); it should be (low, high) with low <= high")

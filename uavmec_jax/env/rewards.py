@@ -10,6 +10,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
+from uavmec_jax.env.checks import Bounds, Check, check_ranges
 from uavmec_jax.env.dynamics import Outcome, State, complete_state, living_devices, service
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
@@ -119,10 +120,13 @@ def make_reward(
         per_slot: added for every slot that counts; ``make_reward({}, per_slot=1.0)`` is the lifetime.
 
     Raises:
-        ValueError: the name, a term or the guard is unknown, or the function does not return a scalar.
+        ValueError: the name, a term or the guard is unknown, a number is not finite, or the function does not return a
+            scalar.
     """
     if guard not in LOG_GUARDS:
         raise ValueError(f"unknown log guard {guard!r}; guards are {', '.join(LOG_GUARDS)}")
+    numbers = {"traffic_bonus": traffic_bonus, "traffic_penalty": traffic_penalty, "per_slot": per_slot}
+    check_ranges([Check(name, value, Bounds()) for name, value in numbers.items()])
     common = {
         "log1p": jnp.asarray(guard == "log1p"),
         "traffic_bonus": jnp.float32(traffic_bonus),
@@ -164,6 +168,17 @@ def needs_guard(reward: str | Mapping[str, float]) -> bool:
     else:
         weights = make_weights({term: weight for term, weight in reward.items() if term != SERVICE_TERM})
     return bool(weights[TERMS.index("log A")] or weights[TERMS.index("log O")])
+
+
+def check_reward(reward: Reward) -> None:
+    """Check that all numbers of a reward that are known are finite.
+
+    Raises:
+        ArgumentError: one line.
+    """
+    names = ("weights", "traffic_bonus", "traffic_penalty", "per_slot", "service")
+    given = {name: getattr(reward, name) for name in names if getattr(reward, name) is not None}
+    check_ranges([Check(f"reward.{name}", value, Bounds()) for name, value in given.items()])
 
 
 def check_guard(reward: Reward, layout: Layout) -> None:

@@ -8,11 +8,15 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key, PRNGKeyArray
 
+from uavmec_jax.env.checks import check_range
 from uavmec_jax.env.dynamics import Cause, Outcome, State, complete_state, initial_state, service, transition
 from uavmec_jax.env.generator import ScenarioDistribution, scenario_from_draw
 from uavmec_jax.env.layout import Layout
-from uavmec_jax.env.params import Params
+from uavmec_jax.env.params import MAX_DEVICES, Params, check_params
+from uavmec_jax.env.rewards import check_reward
 from uavmec_jax.env.scenario import Scenario, advance, draw_volumes
+from uavmec_jax.env.scenario_checks import check_scenario
+from uavmec_jax.env.state_checks import check_state
 from uavmec_jax.env.types import Scalar
 
 Policy = Callable[..., Array]
@@ -51,7 +55,14 @@ def slot_volumes(params: Params, n_devices: int, key: PRNGKeyArray, slot: Int[Ar
 
 
 def volume_table(params: Params, n_devices: int, key: PRNGKeyArray, slots: int) -> Float[Array, "slots n"]:
-    """Draw the task volumes of the first slots, in bytes; :func:`rollout` with the same key has the same volumes."""
+    """Draw the task volumes of the first slots, in bytes; :func:`rollout` with the same key has the same volumes.
+
+    Raises:
+        ArgumentError: there are no devices or no slots, or a parameter is out of range; one line.
+    """
+    check_params(params)
+    check_range("n_devices", n_devices, ge=1, le=MAX_DEVICES, whole=True)
+    check_range("slots", slots, ge=1, whole=True)
     return jax.vmap(lambda slot: slot_volumes(params, n_devices, key, slot))(jnp.arange(slots))
 
 
@@ -64,12 +75,22 @@ def rollout(policy: Policy, params: Params, layout: Layout, key: PRNGKeyArray) -
         layout: the devices.
         key: draws the task volumes: two policies with the same key have the same volumes, slot by slot. The policy's
             own randomness comes from another stream of the key.
+
+    Raises:
+        ArgumentError: a parameter or a value of the layout is out of range; one line. Traced values are checked only inside
+            :func:`um.debug_checks`. Nor are the policy's actions known here: out of range is clamped.
     """
     return rollout_from(policy, params, layout, initial_state(params, layout), key)
 
 
 def rollout_from(policy: Policy, params: Params, layout: Layout, state: State, key: PRNGKeyArray) -> Episode:
-    """Play an episode as :func:`rollout` does, but from any state in which the episode has not ended."""
+    """Play an episode as :func:`rollout` does, but from any state in which the episode has not ended.
+
+    Raises:
+        ArgumentError: as in :func:`rollout`, and for the state.
+    """
+    check_scenario(params, layout)
+    check_state(layout, state)
     return _play(policy, params, layout, state, key, slots=0)[1]
 
 
@@ -175,12 +196,19 @@ def _initial_outcome(n: int) -> Outcome:
 
 
 def rollouts(policy: Policy, params: Params, layout: Layout, keys: Key[Array, " D"]) -> Episode:
-    """Play one episode per key, that is, per draw of the task volumes; the result's leaves are ``[D, ...]``."""
+    """Play one episode per key, that is, per draw of the task volumes; the result's leaves are ``[D, ...]``.
+
+    Raises:
+        ArgumentError: as in :func:`rollout`, or there is no key.
+    """
+    check_range("the number of keys", len(keys), ge=1, whole=True)
     return jax.vmap(lambda key: rollout(policy, params, layout, key))(keys)
 
 
 def returns(policy: Policy, scenario: Scenario, keys: Key[Array, " D"]) -> Float[Array, " D"]:
     """Return the undiscounted sums of the rewards in the episodes that :func:`rollouts` plays."""
+    check_scenario(scenario.params, scenario.layout)
+    check_reward(scenario.reward)
 
     def episode_return(key: PRNGKeyArray) -> Float[Array, ""]:
         act, volumes = _make_act_and_volumes(policy, scenario.params, scenario.layout, key)
@@ -223,7 +251,14 @@ def trace(policy: Policy, params: Params, layout: Layout, key: PRNGKeyArray, slo
 
 
 def trace_from(policy: Policy, params: Params, layout: Layout, state: State, key: PRNGKeyArray, slots: int) -> Trace:
-    """Record the next ``slots`` slots of the episode that :func:`rollout_from` plays with the same key."""
+    """Record the next ``slots`` slots of the episode that :func:`rollout_from` plays with the same key.
+
+    Raises:
+        ArgumentError: as in :func:`rollout_from`, or there are no slots.
+    """
+    check_scenario(params, layout)
+    check_state(layout, state)
+    check_range("slots", slots, ge=1, whole=True)
     play_slot = _make_play_slot(policy, params, layout, key)
 
     def play_if(carry: tuple[State, Outcome], _: None) -> tuple[tuple[State, Outcome], Trace]:

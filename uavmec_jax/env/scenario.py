@@ -5,12 +5,13 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
-from uavmec_jax.env.dynamics import Cause, Outcome, State, initial_state, living_devices, transition
+from uavmec_jax.env.dynamics import Cause, Outcome, State, fresh_state, living_devices, transition
 from uavmec_jax.env.layout import Layout, sample_layout
 from uavmec_jax.env.params import Params
-from uavmec_jax.env.rewards import Reward, check_guard, make_reward, reward_of, traffic_reward
+from uavmec_jax.env.rewards import Reward, check_guard, check_reward, make_reward, reward_of, traffic_reward
+from uavmec_jax.env.scenario_checks import check_scenario
 
 
 @struct.dataclass
@@ -37,6 +38,8 @@ def make_scenario(layout: Layout | None = None, params: Params | None = None, re
         reward: by default the one that the paper found best.
 
     Raises:
+        ArgumentError: a value is out of range, or the layout has another number of devices than the parameters; one line.
+            Traced values are checked only inside :func:`um.debug_checks`.
         ValueError: there are depots, and the reward has a bare logarithm of an age, which is 0 at a depot.
     """
     params = Params() if params is None else params
@@ -45,6 +48,8 @@ def make_scenario(layout: Layout | None = None, params: Params | None = None, re
         layout = sample_layout(jax.random.key(0), params, count, count)
     if reward is None:
         reward = make_reward(guard="log1p" if layout.n_depots else "clamp")
+    check_scenario(params, layout)
+    check_reward(reward)
     check_guard(reward, layout)
     return Scenario(params=params, layout=layout, reward=reward)
 
@@ -58,7 +63,7 @@ def draw_volumes(params: Params, uniform: Float[Array, "*shape"]) -> Float[Array
 def advance(
     scenario: Scenario,
     state: State,
-    action: Int[ArrayLike, ""] | Int[Array, " K"],
+    action: Num[ArrayLike, ""] | Num[Array, " K"],
     volumes: Float[Array, " n"],
 ) -> tuple[State, Float[Array, ""], Outcome]:
     """Play one slot with explicit volumes, without a reset, and return the next state, the reward and the outcome."""
@@ -78,7 +83,7 @@ def is_truncated(scenario: Scenario, state: State, outcome: Outcome) -> Bool[Arr
 
 def auto_reset(ended: Bool[Array, ""], scenario: Scenario, before: State, after: State) -> State:
     """Return the initial state if the slot from ``before`` to ``after`` has ended the episode, else ``after``."""
-    fresh = initial_state(scenario.params, scenario.layout)
+    fresh = fresh_state(scenario.params, scenario.layout)
     state = jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, after)
     if scenario.params.end == "first_failure":  # what no slot changes that an episode goes on from costs a loop nothing
         state = replace(state, failed_at=before.failed_at)

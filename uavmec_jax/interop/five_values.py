@@ -4,7 +4,7 @@ from typing import Any
 
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, Float, Num, PRNGKeyArray
 
 from uavmec_jax.env.dynamics import State
 from uavmec_jax.env.environment import UavMecEnv
@@ -47,9 +47,13 @@ class FiveValueEnv:
         return self._env.reset(key, (params or self.default_params).scenario)
 
     def step(
-        self, key: PRNGKeyArray, state: State, action: Int[ArrayLike, ""], params: FiveValueParams | None = None
+        self, key: PRNGKeyArray, state: State, action: Num[ArrayLike, ""], params: FiveValueParams | None = None
     ) -> tuple[Float[Array, " two_n"], State, Float[Array, ""], Bool[Array, ""], dict[str, Array]]:
-        """Play one slot, with an automatic reset at the end of an episode."""
+        """Play one slot, with an automatic reset at the end of an episode.
+
+        Raises:
+            ArgumentError: there is no such device; one line. A traced action is clamped.
+        """
         scenario = (params or self.default_params).scenario
         observation, state, reward, terminated, truncated, info = self._env.step(key, state, action, scenario)
         return observation, state, reward, terminated | truncated, info | {"discount": 1.0 - terminated}

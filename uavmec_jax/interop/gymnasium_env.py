@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
+from uavmec_jax.env.checks import check_action
 from uavmec_jax.env.dynamics import Cause, State, initial_state
 from uavmec_jax.env.layout import check_one_uav
 from uavmec_jax.env.observation import observe
@@ -51,7 +52,8 @@ class UavMecGymEnv(gymnasium.Env):
             render_mode: ``None`` or ``"rgb_array"``.
 
         Raises:
-            ValueError: the render mode is another one, or the layout has several UAVs or depots.
+            ValueError: the render mode is another one, the layout has several UAVs or depots, or a value of the scenario is
+                out of range.
         """
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode is {render_mode!r}; it should be None or 'rgb_array'")
@@ -74,7 +76,12 @@ class UavMecGymEnv(gymnasium.Env):
         return self._initial_observation.copy(), {}
 
     def step(self, action: Any) -> tuple[Float[np.ndarray, " two_n"], float, bool, bool, dict[str, Any]]:
-        """Visit the device ``action``, with task volumes drawn from the environment's generator."""
+        """Visit the device ``action``, with task volumes drawn from the environment's generator.
+
+        Raises:
+            ArgumentError: there is no such device; one line.
+        """
+        check_action(action, self._n)
         uniform = self.np_random.random(self._n, dtype=np.float32)
         self._state, packed = self._play_slot(self._state, np.int32(action), uniform)
         self._last_action = int(action)

@@ -12,11 +12,13 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from uavmec_jax.env.checks import check_action, check_range
 from uavmec_jax.env.dynamics import Cause, State
 from uavmec_jax.env.environment import UavMecEnv
 from uavmec_jax.env.layout import sample_layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.scenario import Scenario, make_scenario
+from uavmec_jax.env.scenario_checks import check_scenario
 from uavmec_jax.interop.gymnasium_env import make_spaces
 
 _CAUSES = np.array([cause.name.lower() for cause in Cause])
@@ -41,10 +43,12 @@ class UavMecVectorEnv(VectorEnv):
                 and 8 connected devices, drawn with the keys 0 to N - 1.
 
         Raises:
-            ValueError: the batch of scenarios has another size.
+            ValueError: the batch of scenarios has another size, or a value is out of range.
         """
+        check_range("num_envs", num_envs, ge=1, whole=True)
         self.num_envs = num_envs
         self._scenarios = _batch(num_envs, scenario)
+        check_scenario(self._scenarios.params, self._scenarios.layout)
         self.single_observation_space, self.single_action_space = make_spaces(self._scenarios)
         self.observation_space: gymnasium.Space = batch_space(self.single_observation_space, num_envs)
         self.action_space: gymnasium.Space = batch_space(self.single_action_space, num_envs)
@@ -71,7 +75,12 @@ class UavMecVectorEnv(VectorEnv):
         Bool[np.ndarray, " N"],
         dict[str, Any],
     ]:
-        """Play one slot in every environment; ``actions`` is ``[N]``."""
+        """Play one slot in every environment; ``actions`` is ``[N]``.
+
+        Raises:
+            ArgumentError: there is no such device; one line that names the environment.
+        """
+        check_action(actions, self._scenarios.layout.n_devices, ("environment",))
         actions = jnp.asarray(actions, jnp.int32)
         observation, self._state, *results = _step(
             self._env, self._scenarios, self._key, np.uint32(self._steps), self._state, actions

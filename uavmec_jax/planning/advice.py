@@ -14,12 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Key, PRNGKeyArray
 
+from uavmec_jax.env.checks import check_range
 from uavmec_jax.env.dynamics import State, complete_state, initial_state
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Episode, Policy, rollout_from, trace_from
+from uavmec_jax.env.scenario_checks import check_scenario
+from uavmec_jax.env.state_checks import check_state
 from uavmec_jax.planning.changes import WhatIf, layouts_to_try, rank_changes, states_to_try
-from uavmec_jax.planning.forecast import SAMPLES, Forecast
+from uavmec_jax.planning.forecast import MAX_SAMPLES, SAMPLES, Forecast
 from uavmec_jax.planning.rollout_planner import candidates_of, prefer, try_candidates, values_of
 
 _RETURN_SAMPLES = 32
@@ -129,10 +132,16 @@ def advise(
         key: of the futures' task volumes; by default the same in every call.
         samples: number of futures.
         what_if: whether to try every repair and removal too.
+
+    Raises:
+        ArgumentError: a parameter, a value of the layout or the state, or the number of futures is out of range; one line.
     """
+    check_range("samples", samples, ge=1, le=MAX_SAMPLES, whole=True)
+    check_scenario(params, layout)
     state = initial_state(params, layout) if state is None else state
     chex.assert_equal_shape([state.battery, state.age, layout.capacity])
     state = complete_state(layout, state)
+    check_state(layout, state)
     futures = jax.random.split(jax.random.key(0) if key is None else key, samples)
     action = None if layout.n_uavs == 1 else _choose(policy, params, layout, state, futures[0])
     uavs = []

@@ -26,9 +26,11 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Int, Num
 
+from uavmec_jax.env.checks import check_range, check_volumes
 from uavmec_jax.env.dynamics import Cause, Outcome, State, initial_state, transition
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
+from uavmec_jax.env.scenario_checks import check_scenario
 from uavmec_jax.planning.beam_score import Problem, ValueFn, dominated, make_problem, score
 from uavmec_jax.planning.fleet_deadlines import earliest_deadline
 from uavmec_jax.planning.fleet_demand import counting_bound
@@ -89,8 +91,12 @@ def beam_search(
             high where the visits still needed take a small share of the remaining slots.
 
     Raises:
+        ArgumentError: a parameter, a volume, a value of the layout or the width is out of range; one line.
         ValueError: episodes do not end with the first failure.
     """
+    check_scenario(params, layout)
+    check_volumes(volumes, layout.n_devices)
+    check_range("width", width, ge=1, whole=True)
     chex.assert_shape(volumes, (None, layout.capacity.shape[0]))
     if params.end != "first_failure":
         raise ValueError(f"end is {params.end!r}; the beam searches for the longest time to the 'first_failure'")

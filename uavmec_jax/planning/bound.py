@@ -40,8 +40,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, Num
 
+from uavmec_jax.env.checks import check_range, check_volumes
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
+from uavmec_jax.env.scenario_checks import check_scenario
 from uavmec_jax.planning.bound_instance import Instance, instances
 from uavmec_jax.planning.device_rows import add_age_rows, add_battery_rows
 from uavmec_jax.planning.energy_rows import add_depot_rows, add_endurance_rows, endurance
@@ -61,8 +63,12 @@ def upper_bound(params: Params, layout: Layout, volumes: Num[Array, "H n"], reac
         reached: a lifetime that some policy reaches; the search starts there and is short if it is optimal.
 
     Raises:
+        ArgumentError: something is not finite or out of range, and a bound would certify nothing; one line.
         ValueError: the volumes end before a lifetime may, or episodes do not end with the first failure.
     """
+    check_scenario(params, layout)  # here without the batch's axis, so that the message names the device
+    check_volumes(volumes, layout.n_devices)
+    check_range("reached", reached, ge=0, whole=True)
     params, layout, volumes = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], (params, layout, volumes))
     return int(upper_bounds(params, layout, volumes, np.array([reached]))[0])
 
@@ -71,6 +77,9 @@ def upper_bounds(
     params: Params, layouts: Layout, volumes: Num[Array, "B H n"], reached: Num[np.ndarray, " B"]
 ) -> Int[np.ndarray, " B"]:
     """Return the :func:`upper_bound` of each of ``B`` scenarios; every leaf has a leading ``B``."""
+    check_scenario(params, layouts)
+    check_volumes(volumes, layouts.n_devices)
+    check_range("reached", reached, ge=0, axes=("scenario",))
     chex.assert_shape(volumes, (len(reached), None, layouts.n_devices))
     if params.end != "first_failure":
         raise ValueError(f"end is {params.end!r}; upper bounds on lifetimes are for 'first_failure'")

@@ -12,6 +12,7 @@ from uavmec_jax.env.dynamics import slots_to_expiry
 from uavmec_jax.env.fleet import Depots
 from uavmec_jax.env.layout import Layout, fleet_of
 from uavmec_jax.env.params import Params
+from uavmec_jax.errors import ArgumentError
 from uavmec_jax.planning import demand, fleet_demand
 from uavmec_jax.planning.hover_sets import MAX_LISTED, number_of_sets
 
@@ -125,8 +126,17 @@ def _quantities(params: Params, layout: Layout, volumes: Num[Array, "H n"]) -> d
 
 
 def instances(params: Params, layouts: Layout, volumes: Num[Array, "B H n"]) -> Iterator[Instance]:
-    """Return the instances of ``B`` scenarios; every leaf has a leading ``B``."""
+    """Return the instances of ``B`` scenarios; every leaf has a leading ``B``.
+
+    Raises:
+        ArgumentError: a quantity overflowed; one line.
+    """
     batch = {name: np.asarray(leaf) for name, leaf in _quantities(params, layouts, volumes).items()}
+    for name, leaf in batch.items():
+        if leaf.dtype == np.float32 and np.isnan(leaf).any():
+            raise ArgumentError(
+                f"the scenario gives {name} that is not a number; its numbers are too large or too small"
+            )
     batch = {name: leaf.astype(float) if leaf.dtype == np.float32 else leaf for name, leaf in batch.items()}
     depots = None if layouts.depots is None else jax.tree.map(np.asarray, layouts.depots)
     for number in range(len(volumes)):

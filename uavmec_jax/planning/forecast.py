@@ -8,13 +8,20 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, Num
 
+from uavmec_jax.env.checks import check_range
 from uavmec_jax.env.dynamics import Cause, State, complete_state, initial_state
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Episode, Policy, rollout_from
+from uavmec_jax.env.scenario_checks import check_scenario
+from uavmec_jax.env.state_checks import check_state
 
 SAMPLES = 256
 """Futures simulated for a forecast by default."""
+
+
+MAX_SAMPLES = 1_000_000
+"""Most futures."""
 
 
 @dataclass(frozen=True)
@@ -92,8 +99,14 @@ def make_forecast(
         state: the present state; by default the initial one.
         key: of the futures' task volumes; by default the same in every call.
         samples: number of futures.
+
+    Raises:
+        ArgumentError: a parameter, a value of the layout or the state, or the number of futures is out of range; one line.
     """
+    check_range("samples", samples, ge=1, le=MAX_SAMPLES, whole=True)
+    check_scenario(params, layout)
     state = initial_state(params, layout) if state is None else complete_state(layout, state)
+    check_state(layout, state)
     futures = jax.random.split(jax.random.key(0) if key is None else key, samples)
     return Forecast.of(_simulate(policy, params, layout, state, futures))
 

@@ -9,16 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
+from uavmec_jax.env.checks import check_range
 from uavmec_jax.env.dynamics import Cause
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.measures import ServiceMeasures, measure
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Episode, Trace, tour_policy, trace
+from uavmec_jax.env.scenario_checks import check_scenario
 from uavmec_jax.planning import beam
 from uavmec_jax.planning.changes import WhatIf, layouts_to_try, rank_changes
 from uavmec_jax.planning.fleet_deadlines import earliest_deadline
 from uavmec_jax.planning.fleet_demand import is_alone, planned_slots
-from uavmec_jax.planning.forecast import Forecast
+from uavmec_jax.planning.forecast import MAX_SAMPLES, Forecast
 from uavmec_jax.planning.heuristics import FLEET_HEURISTICS, HEURISTICS
 from uavmec_jax.planning.parallel import (
     beam_episodes,
@@ -93,7 +95,15 @@ def make_plan(
         draws: volume draws; policies are evaluated on all of them, the tours are those of the first.
         width: states that the beam keeps; by default :data:`WIDTH`, for fleets as many as in studies.
         samples: futures that the rollout planner simulates per candidate.
+
+    Raises:
+        ArgumentError: a parameter, a value of the layout or a number is out of range, or there is no draw; one line.
     """
+    check_scenario(params, layout)
+    check_range("the number of draws", len(draws), ge=1, whole=True)
+    check_range("samples", samples, ge=1, le=MAX_SAMPLES, whole=True)
+    if width is not None:
+        check_range("width", width, ge=1, whole=True)
     width = (WIDTH if is_alone(layout) else beam.WIDTH) if width is None else width
     count, goes_on = draws.shape[0], params.end == "horizon"
     per_draw, unchanged = _repeat(params, count), _repeat(layout, count)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key, PRNGKeyArray
 
+from uavmec_jax.env.checks import check_range
 from uavmec_jax.env.dynamics import State
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
@@ -42,8 +43,10 @@ def rollout_planner(base: Policy = earliest_deadline, samples: int = SAMPLES) ->
         samples: futures simulated per candidate.
 
     Raises:
+        ArgumentError: there are no futures; one line.
         ValueError: (when called) no key was given.
     """
+    check_range("samples", samples, ge=1, whole=True)
 
     def policy(params: Params, layout: Layout, state: State, key: PRNGKeyArray | None = None) -> Array:
         if key is None:

@@ -5,6 +5,7 @@ from jaxtyping import Array, Float
 
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
+from uavmec_jax.env.scenario_checks import check_scenario
 
 _SLACK = 1e-5
 """Relative tolerance for the single precision of the slot's physics, in favour of the network."""
@@ -21,7 +22,12 @@ def service_bound(params: Params, layout: Layout) -> Float[Array, ""]:
     Args:
         params: scenario parameters; ``end`` need not be ``"horizon"``, ``horizon_s`` is the time.
         layout: the devices, with full batteries; UAVs and depots make no difference. Use ``vmap`` for several.
+
+    Raises:
+        ArgumentError: something is not finite or out of range, and a bound would certify nothing; one line. Traced values
+            are checked only inside :func:`um.debug_checks`.
     """
+    check_scenario(params, layout)
     drains = ~layout.has_power & (layout.standby_power > 0)
     lasts = layout.capacity * (1.0 + _SLACK) / jnp.where(drains, layout.standby_power, 1.0)
     share = jnp.where(drains, jnp.minimum(lasts / params.horizon_s, 1.0), 1.0)

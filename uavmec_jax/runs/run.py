@@ -26,7 +26,7 @@ from uavmec_jax.runs.results_folder import (
     partial_results,
     read_finished_shards,
 )
-from uavmec_jax.runs.run_plan import RunPlan, label_of, plan_run
+from uavmec_jax.runs.run_plan import RunPlan, check_shard_size, label_of, plan_run
 from uavmec_jax.runs.shard_runner import ShardRunner
 from uavmec_jax.runs.signals import StopSignal
 from uavmec_jax.studies.results import Results
@@ -71,11 +71,13 @@ def run_study(
         on_event: called with ``(event, facts)`` of everything that is logged.
 
     Raises:
+        ArgumentError: ``shard_size`` is not a positive number.
         StudyError: the population does not fit in memory, the directory cannot take a run or another process works in it,
             shards failed, ``reward`` is given beside an axis of rewards, a package is not installed, Ray cannot be reached,
             or is given without a directory or with a reward function; the directory is a URL, and its object store cannot
             be reached or written to.
     """
+    check_shard_size(shard_size)  # before Ray is started
     if reward is not None and "reward" in study.axes:
         raise StudyError(f"{study.name}: axes.reward is given, and a reward function too; leave one of them out")
     ray = RayOptions.of(ray)

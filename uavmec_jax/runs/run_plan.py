@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
 
+from uavmec_jax.env.checks import check_range
 from uavmec_jax.errors import StudyError
 from uavmec_jax.studies.parts import split_study
 from uavmec_jax.studies.places import describe_places, load_evacuations
@@ -96,6 +97,16 @@ class RunPlan:
         return f"{self.agents:,} agents x {steps:,} steps in {count} shard{'s' * (count > 1)}{of_size} on {devices}, {memory}"
 
 
+def check_shard_size(shard_size: int | None) -> None:
+    """Check the number of agents in a shard, if one is given.
+
+    Raises:
+        ArgumentError: it is not a positive number; one line.
+    """
+    if shard_size is not None:
+        check_range("shard_size", shard_size, ge=1, whole=True)
+
+
 def plan_run(study: Study, *, shard_size: int | None = None, machine: Machine | None = None) -> RunPlan:
     """Estimate the memory of a study and cut its population into equal shards.
 
@@ -105,9 +116,11 @@ def plan_run(study: Study, *, shard_size: int | None = None, machine: Machine | 
         machine: what a shard has; by default this machine.
 
     Raises:
+        ArgumentError: ``shard_size`` is not a positive number.
         StudyError: the population does not fit in memory.
         TrafficError: the traffic of one of the study's places is not usable.
     """
+    check_shard_size(shard_size)
     load_evacuations(study)
     machine = machine or Machine.here()
     agents, free = n_agents(study), host.free_memory()

@@ -1,6 +1,7 @@
 """Load a scenario: from a file, or the random one that a seed stands for in every study."""
 
 from dataclasses import replace
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +50,7 @@ def load_scenario(
         StateError: the state does not fit the scenario.
         TrafficError: the place is not usable, or a hop in it would take longer than a slot may.
     """
-    if not 0 <= seed < 2**31:
+    if not _is_whole(seed) or not 0 <= seed < 2**31:
         raise ScenarioError(f"seed is {seed}; give a whole number from 0 to {2**31 - 1}")
     if file is not None:
         scenario = replace(load_scenario_file(file, settings), draw_id=(seed, 0, 0))
@@ -59,9 +60,14 @@ def load_scenario(
     return scenario if state is None else replace(scenario, state=load_state(state, scenario))
 
 
+def _is_whole(number: Any) -> bool:
+    """Return whether a number is an integer, Python's or NumPy's."""
+    return isinstance(number, Integral) and not isinstance(number, bool)
+
+
 def _vehicles(params: Params, uavs: int, depot: str | None) -> dict[str, Any]:
     """Return the UAVs and the depot as fields of a layout; ``None`` for one UAV and for no depot."""
-    if not 1 <= uavs <= MAX_UAVS:
+    if not _is_whole(uavs) or not 1 <= uavs <= MAX_UAVS:
         raise ScenarioError(f"uavs is {uavs}; give 1 to {MAX_UAVS}")
     kinds = [kind.name.lower() for kind in DepotKind]
     if depot is not None and depot not in kinds:
@@ -84,7 +90,7 @@ def _random_scenario(
         params = replace(params, n_devices=evacuation.n_devices, region_m=evacuation.region_m())
         evacuation.check_hops(float(params.uav_speed_m_s), float(params.slot_cap_s))
     for name, count in (("powered", powered), ("connected", connected)):
-        if not 0 <= count <= params.n_devices:
+        if not _is_whole(count) or not 0 <= count <= params.n_devices:
             raise ScenarioError(f"{name} is {count}; give 0 to {params.n_devices}, the number of devices")
     layout = layout_for_seed(seed, params, powered, connected)
     name, device_names = f"{powered} powered, {connected} connected, seed {seed}", None

@@ -6,7 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from uavmec_jax.env.checks import POSITION, check_range
 from uavmec_jax.env.layout import Layout, Traffic
+from uavmec_jax.errors import ArgumentError
 from uavmec_jax.traffic.evacuation import Evacuation
 
 
@@ -20,7 +22,16 @@ def on_place(
         evacuation: a simulated evacuation with ``n`` devices.
         moving: whether the traffic weights follow the evacuation's windows; by default they are its mean, as in the paper.
         scale_to_m: see :meth:`Evacuation.local_position`.
+
+    Raises:
+        ArgumentError: the numbers of devices differ, or the length is not positive; one line.
     """
+    if layout.n_devices != evacuation.n_devices:
+        raise ArgumentError(
+            f"layout has {layout.n_devices} devices; {evacuation.name} has {evacuation.n_devices}, give a layout of as many"
+        )
+    if scale_to_m is not None:
+        check_range("scale_to_m", scale_to_m, gt=0, le=POSITION.le)
     traffic = Traffic(
         weight=jnp.asarray(traffic_weights(evacuation, moving)),
         window_s=jnp.float32(evacuation.meta["window_s"]),

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, get_args
 import pydantic
 from pydantic import Field
 
-from uavmec_jax.agents.registry import ALGORITHMS, SCENARIO_SETTINGS, check_end
+from uavmec_jax.agents.registry import ALGORITHMS, MAX_STEPS, SCENARIO_SETTINGS, check_end
 from uavmec_jax.env.fleet import MAX_UAVS
 from uavmec_jax.env.rewards import DEFAULT_REWARD, LOG_GUARDS
 from uavmec_jax.files.validation import StrictModel, from_array, model_from_dataclasses
@@ -86,7 +86,7 @@ class Study(StrictModel):
     """``none`` trains nothing and evaluates heuristics and planners only. Several algorithms are an axis."""
     reward: str | dict[str, float] = DEFAULT_REWARD
     guard: Guard = "clamp"
-    steps: Annotated[int, Field(ge=1, le=2_000_000_000)] = 1_000_000
+    steps: Annotated[int, Field(ge=1, le=MAX_STEPS)] = 1_000_000
     """Environment steps of one agent."""
     place: str = ""
     """A place whose evacuation was simulated, by name or file; if empty, positions are random and traffic is unknown."""
@@ -233,7 +233,7 @@ def _check_algorithms(study: Study) -> None:
     for name in study.algorithms:
         try:
             ALGORITHMS[name].make(
-                getattr(study, name).model_dump(), total_steps=1, n_devices=study.params.n_devices, max_age=1
+                getattr(study, name).model_dump(), total_steps=study.steps, n_devices=study.params.n_devices, max_age=1
             )
         except ValueError as error:
             raise ValueError(f"{name}.{error}") from None

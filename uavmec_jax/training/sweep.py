@@ -1,5 +1,6 @@
 """``um.train``: train agents on any scenarios and with any hyperparameters, as one program."""
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -9,18 +10,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
+import pydantic
 from jaxtyping import PRNGKeyArray
 
 from uavmec_jax.agents.algorithm import Agent, Algorithm
-from uavmec_jax.agents.registry import ALGORITHMS, RegisteredAlgorithm, check_end
+from uavmec_jax.agents.registry import ALGORITHMS, MAX_STEPS, SCENARIO_SETTINGS, RegisteredAlgorithm, check_end
 from uavmec_jax.cluster.connection import connected
 from uavmec_jax.cluster.options import RayOptions
+from uavmec_jax.env.checks import Bounds, Check, check_range, check_ranges
 from uavmec_jax.env.layout import check_one_uav
 from uavmec_jax.env.params import leaf_dtype
+from uavmec_jax.env.rewards import check_reward
 from uavmec_jax.env.rollout import Policy
 from uavmec_jax.env.scenario import Scenario
-from uavmec_jax.errors import StudyError
-from uavmec_jax.files.validation import suggest
+from uavmec_jax.env.scenario_checks import check_scenario
+from uavmec_jax.errors import ArgumentError, StudyError
+from uavmec_jax.files.validation import describe_error, model_from_dataclasses, suggest
 from uavmec_jax.training.chunks import Validation
 from uavmec_jax.training.machine import Machine, probe_node
 from uavmec_jax.training.on_ray import PopulationOnRay, ShardProgram
@@ -104,6 +109,7 @@ def train(
         on_progress: called after every chunk; on Ray, after every shard.
 
     Raises:
+        ArgumentError: a number is out of range: the steps, a hyperparameter, the validation, or a value of a scenario.
         StudyError: an unknown algorithm, hyperparameter or setting, a wrong number of values, too little memory, several
             UAVs or depots, or a DQN on the paper's observation where episodes go on after a failure; on Ray, also if it
             is not installed or cannot be reached, a node has other code, or a shard failed.
@@ -111,9 +117,14 @@ def train(
     """
     if algorithm not in ALGORITHMS:
         raise StudyError(f"algorithm is {algorithm!r}; {suggest(algorithm, ALGORITHMS)}")
+    check_range("steps", steps, ge=1, le=MAX_STEPS, whole=True)
     chex.assert_rank(scenarios.layout.capacity, 2)
+    check_scenario(scenarios.params, scenarios.layout)
+    check_reward(scenarios.reward)
     _check_scenarios(algorithm, scenarios, (settings or {}).get("observation", "paper"))
     registered, validation = ALGORITHMS[algorithm], validation or Validation()
+    for name in ("every", "draws", "chunks"):
+        check_range(f"validation.{name}", getattr(validation, name), ge=1, whole=True)
     n, n_devices = scenarios.layout.capacity.shape
     max_age = int(np.max(scenarios.params.data_age_limit_slots)) + 1
     bound = _bind(registered, settings or {}, steps, n_devices, max_age)
@@ -169,6 +180,12 @@ def _bind(
     for name in settings:
         if name not in defaults:
             raise StudyError(f"settings has {name!r}; {suggest(name, defaults)}")
+    settings = {name: value.item() if isinstance(value, np.generic) else value for name, value in settings.items()}
+    model = model_from_dataclasses("Settings", registered.spec, leave_out=SCENARIO_SETTINGS)
+    try:
+        model.model_validate(settings)
+    except pydantic.ValidationError as error:
+        raise ArgumentError(describe_error("settings", error, model)) from None
     try:
         return registered.make(defaults | dict(settings), total_steps=steps, n_devices=n_devices, max_age=max_age)
     except ValueError as error:
@@ -182,7 +199,11 @@ def _batch_hyper(algorithm: str, registered: RegisteredAlgorithm, hyper: Mapping
             hint = suggest(name, registered.traced)
             raise StudyError(f"hyper has {name!r}, which is not a hyperparameter of {algorithm}; {hint}")
     leaves = {}
-    for name, default in vars(registered.hyper()).items():
+    for field in dataclasses.fields(registered.hyper):
+        name: str = field.name
+        default: Any = field.default
+        bounds = Bounds(ge=0, le=1) if isinstance(default, bool) else Bounds.of(field)
+        check_ranges([Check(f"hyper.{name}", hyper.get(name, default), bounds, ("agent",))])
         value = jnp.asarray(hyper.get(name, default), leaf_dtype(default))
         if value.shape not in ((), (n,)):
             raise StudyError(f"hyper.{name} has shape {value.shape}; give one number or {n} of them, one per scenario")
