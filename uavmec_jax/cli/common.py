@@ -41,6 +41,11 @@ class Interrupt(click.ClickException):
         click.echo(one_line(f"interrupted: {self.message}"), file=file, err=file is None)
 
 
+def is_utf8(text: str) -> bool:
+    """Return whether a text of the command line is UTF-8: Python stands surrogates for bytes that are not."""
+    return not any("\ud800" <= letter <= "\udfff" for letter in text)
+
+
 def assignment(text: str, option: str = "--set") -> tuple[str, Any]:
     """Parse ``NAME=VALUE``, with the value as in TOML; a bare word is a string.
 
@@ -50,6 +55,8 @@ def assignment(text: str, option: str = "--set") -> tuple[str, Any]:
     name, equals, value = text.partition("=")
     if not equals or not name.strip():
         raise InputError(f"{option} {text}: give NAME=VALUE, e.g. {_EXAMPLES.get(option, 'algorithm=dqn')}")
+    if not is_utf8(text):
+        raise InputError(f"{option} {text}: holds bytes that are not UTF-8; give it in UTF-8")
     if len(name) > _MAX_NAME or len(value) > _MAX_VALUE:
         raise InputError(
             f"{option} {text}: is too long; a name has at most {_MAX_NAME} characters, a value at most {_MAX_VALUE:,}"

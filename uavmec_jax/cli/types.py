@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from uavmec_jax.cli.common import InputError
+from uavmec_jax.cli.common import InputError, is_utf8
 
 _MAX_PATH_BYTES, _MAX_NAME_BYTES = 4095, 255
 """What file systems take: bytes of a path, and of each name in it."""
@@ -23,7 +23,8 @@ def name_of(param: click.Parameter | None) -> str:
 
 
 def check_location(location: object, param: click.Parameter | None) -> None:
-    """Refuse what cannot be the path of a file: an empty text, a NUL character, what is longer than file systems take.
+    """Refuse what cannot be the path of a file, or written into results: an empty text, a NUL character, bytes that are not
+    UTF-8, what is longer than file systems take.
 
     Raises:
         InputError: one line that names the option.
@@ -35,7 +36,11 @@ def check_location(location: object, param: click.Parameter | None) -> None:
         raise InputError(f"{name_of(param)} is empty; give a path or a name")
     if "\0" in text:
         raise InputError(f"{name_of(param)} is {text!r}; it holds a NUL character, which no path can")
-    names = text.encode("utf-8", "surrogatepass").split(b"/")
+    if not is_utf8(text):
+        raise InputError(
+            f"{name_of(param)} is {text!r}; it holds bytes that are not UTF-8; give a file with another name"
+        )
+    names = text.encode().split(b"/")
     longest = 0 if is_url(text) else max(map(len, names))
     if sum(map(len, names)) + len(names) - 1 > _MAX_PATH_BYTES or longest > _MAX_NAME_BYTES:
         raise InputError(
