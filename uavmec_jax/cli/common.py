@@ -25,7 +25,7 @@ class InputError(click.ClickException):
 
     def show(self, file: IO[Any] | None = None) -> None:
         """Print the line."""
-        click.echo(one_line(f"uavmec: {self.message}"), file=file, err=file is None)
+        click.echo(one_line(f"uavmec: {self.message}"), file or sys.stderr)
 
 
 class Interrupt(click.ClickException):
@@ -38,7 +38,7 @@ class Interrupt(click.ClickException):
 
     def show(self, file: IO[Any] | None = None) -> None:
         """Print the line."""
-        click.echo(one_line(f"interrupted: {self.message}"), file=file, err=file is None)
+        click.echo(one_line(f"interrupted: {self.message}"), file or sys.stderr)
 
 
 def is_utf8(text: str) -> bool:
@@ -106,14 +106,19 @@ def assignments(texts: Sequence[str], option: str = "--set") -> dict[str, Any]:
     return values
 
 
+def print_line(text: str, *, err: bool = False) -> None:
+    """Print text on standard output or standard error, in their encoding: click would change ASCII to UTF-8."""
+    click.echo(text, sys.stderr if err else sys.stdout)
+
+
 def warn(line: str) -> None:
     """Print a warning on standard error."""
-    click.echo(f"uavmec: warning: {one_line(line)}", err=True)
+    print_line(f"uavmec: warning: {one_line(line)}", err=True)
 
 
 def print_json(data: Any) -> None:
     """Print plain data as JSON on standard output."""
-    click.echo(json.dumps(data, indent=1))
+    print_line(json.dumps(data, indent=1))
 
 
 def print_results(results: Any, directory: Path, console: Any, as_json: bool) -> None:

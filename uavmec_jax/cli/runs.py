@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from uavmec_jax.cli.common import InputError, Interrupt, print_json, print_results
+from uavmec_jax.cli.common import InputError, Interrupt, print_json, print_line, print_results
 from uavmec_jax.cli.options import directory_argument, json_option, ray_options
 from uavmec_jax.cluster.options import RayOptions
 from uavmec_jax.errors import one_line
@@ -145,4 +145,4 @@ def print_simulation(
     if as_json:
         print_json(estimate.as_json())
     else:
-        click.echo(f"{study.name}: {plan}\n{estimate}")
+        print_line(f"{study.name}: {plan}\n{estimate}")

@@ -12,6 +12,7 @@ from uavmec_jax.cli.common import (
     command_line,
     new_folder,
     print_json,
+    print_line,
     print_results,
     print_tables,
 )
@@ -164,13 +165,15 @@ def compare(
     as_json: bool,
 ) -> None:
     """Compare RUN_A with RUN_B seed by seed: paired differences, interquartile means, probability of improvement."""
+    of_a, of_b = assignments(where_a, "--a"), assignments(where_b, "--b")
+
     from uavmec_jax.cli.console import new_console
     from uavmec_jax.reporting.compare import comparison
     from uavmec_jax.runs.results_folder import load_results
     from uavmec_jax.studies.compare import Side
 
-    a = Side(load_results(run_a), policy_a, assignments(where_a, "--a"))
-    b = Side(load_results(run_b), policy_b, assignments(where_b, "--b"))
+    a = Side(load_results(run_a), policy_a, of_a)
+    b = Side(load_results(run_b), policy_b, of_b)
     tables, data = comparison(a, b)
     if as_json:
         print_json({"command": command_line(), **data})
@@ -192,4 +195,4 @@ def validate(file: str, as_json: bool) -> None:
     if as_json:
         print_json(json.loads(study.model_dump_json()))
     else:
-        click.echo(f"{printable(file)}: a valid study: {n_agents(study):,} agents x {study.steps:,} steps")
+        print_line(f"{printable(file)}: a valid study: {n_agents(study):,} agents x {study.steps:,} steps")

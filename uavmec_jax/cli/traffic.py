@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from uavmec_jax.cli.common import InputError, assignments, command_line, print_json
+from uavmec_jax.cli.common import InputError, assignments, command_line, print_json, print_line
 from uavmec_jax.cli.options import MAX_DEVICES, MAX_SEED, json_option, set_option
 from uavmec_jax.cli.types import LocalPath, NameOrPath, WholeNumber, refuse_given
 from uavmec_jax.errors import printable
@@ -159,7 +159,7 @@ def show(
         written.append(animation)
     _print(evacuation, source, as_json)
     for path in written:
-        click.echo(printable(f"File: {path}"), err=as_json)
+        print_line(printable(f"File: {path}"), err=as_json)
 
 
 def _print(evacuation: Any, source: str, as_json: bool) -> None:

@@ -15,6 +15,9 @@ MAX_DEVICES = 1000
 LEAST, MOST = 1e-6, 1e12
 """Bounds of quantities in SI units: far beyond any device or UAV, and products of a few of them are still float32."""
 
+LEAST_CAPACITY_J = 1e-3
+"""Smallest capacity of a device's battery."""
+
 MAX_LENGTH_M = 1e7
 """Largest side of a region, altitude and signal range, m: beyond it, squares of distances lose their metres in float32."""
 
