@@ -17,8 +17,12 @@ def one_line(message: object) -> str:
     if len(text) > MAX_MESSAGE:
         text = _shortened(text)
     text = " ".join(text.split())
-    text = "".join(letter if letter.isprintable() else _escaped(letter) for letter in text)
-    return _shortened(text)
+    return _shortened(printable(text))
+
+
+def printable(text: str, keep: str = "") -> str:
+    """Return a text in which characters that a terminal would obey or cannot show are escapes, but for those to ``keep``."""
+    return "".join(letter if letter.isprintable() or letter in keep else _escaped(letter) for letter in text)
 
 
 def _shortened(text: str) -> str:

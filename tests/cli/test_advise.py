@@ -90,7 +90,7 @@ def test_a_scenario_out_of_distribution_is_advised_on_with_a_warning(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--samples", 1), "--samples is 1; give 2 to 100000 futures"),
+        (("--samples", 1), "--samples is 1; give a whole number from 2 to 100000"),
         (("--policy", "generalst"), "did you mean 'generalist'?"),
         (("--price", 3), "price is given, but the traffic of these devices is unknown"),
         (("--powered", 3), "leave out --powered"),

@@ -127,7 +127,7 @@ def test_doctor():
     ("arguments", "line"),
     [
         (["run", "tabel5"], "uavmec: tabel5: neither a study file nor a shipped study; did you mean 'table5'?"),
-        (["run", "table5", "--seeds", "0"], "uavmec: table5: axes.seeds is 0; give at least 1 seed"),
+        (["run", "table5", "--seeds", "0"], "uavmec: --seeds is 0; give a whole number from 1"),
         (["run", "table5", "--set", "axes.powered=[13]"], "uavmec: table5: axes.powered has 13; give whole numbers"),
         (
             ["run", "table5", "--set", "reward=U+log(A/0)"],

@@ -101,11 +101,11 @@ def test_tables_of_a_random_scenario(tmp_path):
 
 BAD = [
     (["--powered", "13"], "powered is 13; give 0 to 12, the number of devices"),
-    (["--connected", "-1"], "connected is -1; give 0 to 12"),
-    (["--seed", "-1"], "seed is -1; give a whole number from 0"),
+    (["--connected", "-1"], "--connected is -1; give a whole number from 0 to 1000"),
+    (["--seed", "-1"], "--seed is -1; give a whole number from 0"),
     (["--draws", "0"], "--draws is 0; give a whole number from 1"),
-    (["--width", "0"], "--width is 0; give 1 to 100000 states"),
-    (["--set", "uav_speed_m_s=0.0"], "--set: uav_speed_m_s is 0.0; it should be greater than 0"),
+    (["--width", "0"], "--width is 0; give a whole number from 1 to 100000"),
+    (["--set", "uav_speed_m_s=0.0"], "--set: uav_speed_m_s is 0.0; it should be greater than or equal to"),
     (["--set", "device_battery_range_j=[8e4,5e4]"], "--set: device_battery_range_j is [80000.0, 50000.0]; give"),
     (["none.toml"], "none.toml: cannot be read: No such file"),
     ([str(EXAMPLES / "village.csv"), "--powered", "3"], "says which devices have power"),

@@ -100,11 +100,11 @@ def test_study_round_trip():
         ({"axes.uav_speed_m_s": [5.0, 2.0]}, "round_lake: the hop from "),
         ({"params.slot_cap_s": 300.0}, "s at 5 m/s; a slot lasts at most 300 s (slot_cap_s)"),
         ({"axes.place": [3]}, "x: axes.place has 3; give names of places or paths of their files"),
-        ({"axes.traffic_bonus": [-1.0]}, "x: axes.traffic_bonus has -1.0; give finite numbers from 0"),
+        ({"axes.traffic_bonus": [-1.0]}, "x: axes.traffic_bonus has -1.0; give numbers from 0 to 1e+09"),
         ({"axes.traffic_bonus": [float("inf")]}, "x: axes.traffic_bonus has inf"),
         ({"traffic_penalty": -1.0}, "x: traffic_penalty is -1.0; it should be greater than or equal to 0"),
         ({"traffic": "fast"}, "x: traffic is 'fast'; it should be 'static' or 'moving'"),
-        ({"place_scale_m": 0.0}, "x: place_scale_m is 0.0; it should be greater than 0"),
+        ({"place_scale_m": 0.0}, "x: place_scale_m is 0.0; it should be greater than or equal to 1"),
     ],
     ids=str,
 )

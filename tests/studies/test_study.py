@@ -190,6 +190,7 @@ BAD = [
         "bad.toml: params.end is 'horizon', and algorithm is 'dqn', whose replay of the paper's observation holds no ages",
     ),
     ({"evaluation.beam_width": 0}, "bad.toml: evaluation.beam_width is 0; it should be greater than or equal to 1"),
+    ({"evaluation.draws": 4, "evaluation.planner_draws": 5}, "evaluation.planner_draws is 5; give at most evaluation.draws"),
     ({"evaluation.planner_draws": 0}, "bad.toml: evaluation.planner_draws is 0; it should be greater"),
     ({"name": "../x"}, "bad.toml: name is '../x'"),
 ]
@@ -285,3 +286,10 @@ def test_table6_is_the_papers_table():
     axes = ("reward", "powered", "connected", "algorithm")
     assert {tuple(agent_id[axis] for axis in axes) for agent_id in make_agent_ids(study)} == set(TABLE6)
     assert max(TABLE6.values()) == 30  # U+log(A/O), 10 powered, 8 connected, DQN
+
+
+def test_planners_are_evaluated_on_all_draws_if_they_are_fewer_than_by_default():
+    study = load_study("table5", {"evaluation.draws": 3})
+    assert study.evaluation.planner_draws == 3
+    assert parse_study(study_toml(study), "again") == study
+    assert load_study("table5", {"evaluation.draws": 9}).evaluation.planner_draws == 8

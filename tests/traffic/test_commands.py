@@ -58,7 +58,7 @@ BAD = [
     (["build", "--osm", "x.osm", "--out", "no/x.npz"], "--out no/x.npz: no is not a folder that can be written to"),
     (["build", "--osm", "x.osm", "--exit", "a=b"], "--exit a=b: the weight is 'b'; give NAME=WEIGHT"),
     (["build", "--osm", "x.osm", "--exit", "a=-1"], "x.osm: demand.exits.a is -1.0; it should be greater than 0"),
-    (["build", "--osm", "x.osm", "--vehicles", "0"], "x.osm: demand.vehicles is 0; it should be greater than or equal"),
+    (["build", "--osm", "x.osm", "--vehicles", "0"], "--vehicles is 0; give a whole number from 1 to 1000000"),
     (["build", "--osm", "x.osm", "--set", "vehicles=3"], "--set vehicles: name a table and a setting, e.g. demand.ve"),
     (["build", "--osm", "x.osm", "--set", "demand.cars=3"], "x.osm: demand.cars is not a setting"),
     (["build", "--osm", "x.osm", "--devices", "empty.toml"], "empty.toml: holds no [[device]] tables"),

@@ -39,11 +39,11 @@ class DQNHyper:
     """Share of an action's disadvantage that advantage learning subtracts from its target."""
     average_decay: Scalar = struct.field(default=0.999, metadata={"ge": 0, "lt": 1})
     """Weight of the past in the averaged weights, from one gradient step to the next, if weights are averaged."""
-    target_interval: Scalar = struct.field(default=10_000, metadata={"ge": 1})
+    target_interval: Scalar = struct.field(default=10_000, metadata={"ge": 1, "le": 2_000_000_000})
     """Environment steps of one agent between updates of the target network."""
     tau: Scalar = struct.field(default=1.0, metadata={"gt": 0, "le": 1})
     """Weight of the online network in an update of the target network: 1 copies it, less is a soft update."""
-    learning_starts: Scalar = struct.field(default=100, metadata={"ge": 0})
+    learning_starts: Scalar = struct.field(default=100, metadata={"ge": 0, "le": 2_000_000_000})
     """Environment steps of one agent with random actions and without gradient steps."""
     max_grad_norm: Scalar = struct.field(default=10.0, metadata={"gt": 0})
     age_scale: Scalar = struct.field(default=1.0, metadata={"gt": 0})
@@ -59,11 +59,11 @@ class DQNSpec:
     hidden: tuple[int, ...] = field(default=(64, 64), metadata={"items": {"ge": 1, "le": 4096}})
     observation: str = field(default="paper", metadata={"choices": tuple(OBSERVATIONS)})
     """Input of the network: ``paper`` (batteries and ages), or ``full``, with which it is permutation-equivariant."""
-    batch_size: int = field(default=16, metadata={"ge": 1})
+    batch_size: int = field(default=16, metadata={"ge": 1, "le": 1_000_000})
     train_frequency: int = field(default=4, metadata={"ge": 1, "le": 64})
     """Environment steps per gradient step."""
-    replay_capacity: int = field(default=1_000_000, metadata={"ge": 1})
-    scenario_ring: int = field(default=4096, metadata={"ge": 2})
+    replay_capacity: int = field(default=1_000_000, metadata={"ge": 1, "le": 2_000_000_000})
+    scenario_ring: int = field(default=4096, metadata={"ge": 2, "le": 1_000_000})
     """Drawn scenarios that are kept for the full observation; samples are from the last so many episodes."""
     double: bool = False
     """Whether the online network selects the next action and the target network evaluates it (van Hasselt et al., 2016)."""

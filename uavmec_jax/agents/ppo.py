@@ -36,7 +36,7 @@ class PPOHyper(ActorCriticHyper):
 class PPOSpec(ActorCriticSpec):
     """Static settings, which shape the program."""
 
-    batch_size: int = field(default=64, metadata={"ge": 1})
+    batch_size: int = field(default=64, metadata={"ge": 1, "le": 100_000_000})
     """Size of a minibatch; it divides ``n_steps * n_envs``."""
     n_epochs: int = field(default=10, metadata={"ge": 1, "le": 1000})
     """Passes over each rollout."""

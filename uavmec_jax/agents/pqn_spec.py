@@ -56,7 +56,7 @@ class PQNSpec:
     """Environments of one agent."""
     n_steps: int = field(default=32, metadata={"ge": 1, "le": 1_000_000})
     """Slots played in each environment between updates."""
-    batch_size: int = field(default=64, metadata={"ge": 1})
+    batch_size: int = field(default=64, metadata={"ge": 1, "le": 100_000_000})
     """Size of a minibatch; it divides ``n_steps * n_envs``."""
     n_epochs: int = field(default=2, metadata={"ge": 1, "le": 1000})
     """Passes over each rollout."""

@@ -4,12 +4,18 @@ import json
 import sys
 import time
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
 import click
 
+from uavmec_jax.errors import one_line
+
 _EXAMPLES = {"--set": "--set dqn.gamma=0.99", "--resource": "--resource bigmem=1"}
+
+_MAX_NAME, _MAX_VALUE, _MAX_DEPTH = 200, 100_000, 16
+"""Characters of a setting's name and of its value, and the levels of its tables and lists."""
 
 
 class InputError(click.ClickException):
@@ -19,7 +25,7 @@ class InputError(click.ClickException):
 
     def show(self, file: IO[Any] | None = None) -> None:
         """Print the line."""
-        click.echo(f"uavmec: {' '.join(self.message.split())}", file=file, err=file is None)
+        click.echo(one_line(f"uavmec: {self.message}"), file or sys.stderr)
 
 
 class Interrupt(click.ClickException):
@@ -32,27 +38,87 @@ class Interrupt(click.ClickException):
 
     def show(self, file: IO[Any] | None = None) -> None:
         """Print the line."""
-        click.echo(f"interrupted: {self.message}", file=file, err=file is None)
+        click.echo(one_line(f"interrupted: {self.message}"), file or sys.stderr)
+
+
+def is_utf8(text: str) -> bool:
+    """Return whether a text of the command line is UTF-8: Python stands surrogates for bytes that are not."""
+    return not any("\ud800" <= letter <= "\udfff" for letter in text)
 
 
 def assignment(text: str, option: str = "--set") -> tuple[str, Any]:
     """Parse ``NAME=VALUE``, with the value as in TOML; a bare word is a string.
 
     Raises:
-        InputError: the equals sign or the name is missing.
+        InputError: the equals sign or the name is missing, or the value is longer or deeper than any setting.
     """
     name, equals, value = text.partition("=")
     if not equals or not name.strip():
         raise InputError(f"{option} {text}: give NAME=VALUE, e.g. {_EXAMPLES.get(option, 'algorithm=dqn')}")
+    if not is_utf8(text):
+        raise InputError(f"{option} {text}: holds bytes that are not UTF-8; give it in UTF-8")
+    if len(name) > _MAX_NAME or len(value) > _MAX_VALUE:
+        raise InputError(
+            f"{option} {text}: is too long; a name has at most {_MAX_NAME} characters, a value at most {_MAX_VALUE:,}"
+        )
     try:
-        return name.strip(), tomllib.loads(f"value = {value}")["value"]
+        return name.strip(), _parsed(value)
+    except (RecursionError, ValueError):
+        raise InputError(
+            f"{option} {text}: cannot be read; give tables of at most {_MAX_DEPTH} levels and numbers of at most 4,300 digits"
+        ) from None
+
+
+def _parsed(text: str) -> Any:
+    """Parse a value of TOML; what is none is a string.
+
+    Raises:
+        RecursionError, ValueError: the value is too deep, or a number too long.
+    """
+    try:
+        data = tomllib.loads(f"value = {text}")
     except tomllib.TOMLDecodeError:
-        return name.strip(), value.strip()
+        return text.strip()
+    level = [data]
+    for _ in range(_MAX_DEPTH + 1):
+        level = [
+            inner
+            for one in level
+            if isinstance(one, dict | list)
+            for inner in (one.values() if isinstance(one, dict) else one)
+        ]
+    if level:
+        raise RecursionError
+    return data["value"] if len(data) == 1 else text.strip()
+
+
+def assignments(texts: Sequence[str], option: str = "--set") -> dict[str, Any]:
+    """Parse an option that is given several times, as :func:`assignment`.
+
+    Raises:
+        InputError: as there, or a name is given twice.
+    """
+    values: dict[str, Any] = {}
+    for name, value in (assignment(text, option) for text in texts):
+        if name in values:
+            raise InputError(f"{option} {name}: is given twice; give it once")
+        values[name] = value
+    return values
+
+
+def print_line(text: str, *, err: bool = False) -> None:
+    """Print text on standard output or standard error, in their encoding: click would change ASCII to UTF-8."""
+    click.echo(text, sys.stderr if err else sys.stdout)
+
+
+def warn(line: str) -> None:
+    """Print a warning on standard error."""
+    print_line(f"uavmec: warning: {one_line(line)}", err=True)
 
 
 def print_json(data: Any) -> None:
     """Print plain data as JSON on standard output."""
-    click.echo(json.dumps(data, indent=1))
+    print_line(json.dumps(data, indent=1))
 
 
 def print_results(results: Any, directory: Path, console: Any, as_json: bool) -> None:
@@ -73,7 +139,7 @@ def print_results(results: Any, directory: Path, console: Any, as_json: bool) ->
 def print_tables(console: Any, tables: dict[str, Any], lines: list[str], directory: Path | None = None) -> None:
     """Print tables with their titles, lines below them, and the folder of the files."""
     for title, table in tables.items():
-        console.print(f"[bold]{title}[/bold]")
+        console.print(title, style="bold")
         console.print(table)
     for line in lines:
         console.print(line, highlight=False)
@@ -87,5 +153,5 @@ def new_folder(name: str) -> Path:
 
 
 def command_line() -> str:
-    """Return the command line, for the labels of results."""
-    return " ".join(["uavmec", *sys.argv[1:]])
+    """Return the command line, for the labels of results; bytes of it that are not UTF-8 are escaped."""
+    return " ".join(["uavmec", *sys.argv[1:]]).encode("utf-8", "backslashreplace").decode()

@@ -2,7 +2,7 @@
 
 import click
 
-from uavmec_jax.cli.common import print_json
+from uavmec_jax.cli.common import print_json, print_line
 from uavmec_jax.cli.options import json_option
 
 
@@ -27,4 +27,4 @@ def doctor(as_json: bool) -> None:
             value = ", ".join(value)
         elif isinstance(value, int):
             value = f"{value:,}"
-        click.echo(f"{name.replace('_', ' '):>30}  {value}")
+        print_line(f"{name.replace('_', ' '):>30}  {value}")

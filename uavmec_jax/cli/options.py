@@ -8,50 +8,27 @@ from typing import Any
 
 import click
 
-from uavmec_jax.cli.common import InputError, assignment
+from uavmec_jax.cli.common import InputError, assignments
+from uavmec_jax.cli.types import MAX_SECONDS, FiniteRange, FolderOfRun, LocalPath, NameOrPath, WholeNumber
 from uavmec_jax.cluster.options import RayOptions
 from uavmec_jax.runs.options import CHECKPOINT_KINDS, RunOptions
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON on standard output.")
 
 
-class LocalPath(click.Path):
-    """A path of this machine."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the path, and refuse a URL, of which a path would be made."""
-        from uavmec_jax.files.locations import is_url
-
-        if is_url(value):
-            raise InputError(f"{value}: is in an object store, where only runs can be; give a path of this machine")
-        return super().convert(value, param, ctx)
-
-
-class Location(click.ParamType):
-    """A path of this machine, or a URL of an object store."""
-
-    name = "path"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the path."""
-        from uavmec_jax.files.locations import to_path
-
-        return to_path(value)
-
-
-class FolderOfRun(Location):
-    """A folder on this machine, or the URL of one in an object store."""
-
-    name = "folder"
-
-
-out_option = functools.partial(click.option, "--out", type=LocalPath(path_type=Path))
+out_option = functools.partial(click.option, "--out", type=LocalPath())
 run_folder_option = functools.partial(click.option, "--out", type=FolderOfRun())
 directory_argument = click.argument("directory", type=FolderOfRun())
 set_option = functools.partial(click.option, "--set", "settings", multiple=True, metavar="NAME=VALUE")
 
+MAX_DEVICES, MAX_UAVS, MAX_SEED = 1000, 100, 2**31 - 1
+"""Bounds of lower rooms, which are not imported for the sake of the start-up time; a test compares them."""
+
 _DEFAULT_COUNT = 8
 """Default number of powered, and of connected, devices of a random scenario."""
+
+_MAX_AMOUNT = 1e9
+"""Largest amount of a custom resource."""
 
 
 @dataclass(frozen=True)
@@ -70,11 +47,30 @@ class ScenarioChoice:
     fleet: dict[str, Any]
     settings: dict[str, Any]
 
-    def load(self, state: Path | None = None) -> Any:
-        """Load the :class:`NamedScenario`, in the state of a file or in its initial state."""
-        from uavmec_jax.scenarios.load import load_scenario
+    def check(self) -> None:
+        """Refuse settings that would be ignored.
 
-        return load_scenario(self.file, state=state, settings=self.settings, **self.axes, **self.fleet)
+        Raises:
+            InputError: a place gives what they would change.
+        """
+        for name in ("n_devices", "region_m"):
+            if name in self.settings and "place" in self.axes:
+                raise InputError(f"--set {name}: the place of --place gives it; leave it out")
+
+    def load(self, state: Path | None = None) -> Any:
+        """Load the :class:`NamedScenario`, in the state of a file or in its initial state.
+
+        Raises:
+            InputError: a setting would be ignored in this scenario.
+        """
+        from uavmec_jax.scenarios.load import load_scenario
+        from uavmec_jax.scenarios.settings import unused_params
+
+        scenario = load_scenario(self.file, state=state, settings=self.settings, **self.axes, **self.fleet)
+        for name in sorted(unused_params(scenario.params) - {"end"}):
+            if name in self.settings:
+                raise InputError(f"--set {name}: is only for end = 'horizon'; leave it out, or add --set end=horizon")
+        return scenario
 
 
 def scenario_options(*, argument: bool) -> Callable[[Callable], Callable]:
@@ -83,7 +79,7 @@ def scenario_options(*, argument: bool) -> Callable[[Callable], Callable]:
     Args:
         argument: whether the file is the argument SCENARIO or the option ``--scenario``.
     """
-    path = click.Path(path_type=Path)
+    path = LocalPath()
     file = (
         click.argument("file", metavar="[SCENARIO]", required=False, type=path)
         if argument
@@ -94,17 +90,28 @@ def scenario_options(*, argument: bool) -> Callable[[Callable], Callable]:
     options = (
         file,
         click.option(
-            "--powered", type=int, help="Number of devices with grid power in a random scenario (default: 8)."
+            "--powered",
+            type=WholeNumber(0, MAX_DEVICES),
+            help="Number of devices with grid power in a random scenario (default: 8).",
         ),
         click.option(
-            "--connected", type=int, help="Number of devices with communication in a random scenario (default: 8)."
+            "--connected",
+            type=WholeNumber(0, MAX_DEVICES),
+            help="Number of devices with communication in a random scenario (default: 8).",
         ),
-        click.option("--place", help="Evacuation whose devices a random scenario has (see uavmec traffic)."),
-        click.option("--uavs", type=int, help="Number of UAVs in a random scenario (default: 1)."),
+        click.option(
+            "--place", type=NameOrPath(), help="Evacuation whose devices a random scenario has (see uavmec traffic)."
+        ),
+        click.option("--uavs", type=WholeNumber(1, MAX_UAVS), help="Number of UAVs in a random scenario (default: 1)."),
         click.option(
             "--depot", metavar="KIND", help="Add a depot to a random scenario, at its corner: swap or charge."
         ),
-        click.option("--seed", type=int, default=0, help="Seed of the random scenario and of the task volumes."),
+        click.option(
+            "--seed",
+            type=WholeNumber(0, MAX_SEED),
+            default=0,
+            help="Seed of the random scenario and of the task volumes.",
+        ),
         set_option(help="Change a parameter of Table 1, e.g. --set uav_battery_j=1e6."),
     )
 
@@ -125,7 +132,9 @@ def scenario_options(*, argument: bool) -> Callable[[Callable], Callable]:
                     f"{file}: a scenario file says which UAVs and depots there are; leave out --uavs, --depot"
                 )
             axes = {"powered": _DEFAULT_COUNT, "connected": _DEFAULT_COUNT, "seed": seed} | given
-            return command(scenario=ScenarioChoice(file, axes, fleet, dict(map(assignment, settings))), **others)
+            choice = ScenarioChoice(file, axes, fleet, assignments(settings))
+            choice.check()
+            return command(scenario=choice, **others)
 
         return _add_options(with_scenario, options)
 
@@ -142,7 +151,7 @@ def run_options(command: Callable) -> Callable:
     default = RunOptions()
     options = (
         click.option(
-            "--shard-size", type=click.IntRange(1), help="Most agents in a shard (default: as many as caches hold)."
+            "--shard-size", type=WholeNumber(1, 10**9), help="Most agents in a shard (default: as many as caches hold)."
         ),
         click.option(
             "--checkpoint",
@@ -153,13 +162,13 @@ def run_options(command: Callable) -> Callable:
         click.option(
             "--checkpoint-every",
             "checkpoint_every_s",
-            type=click.FloatRange(0),
+            type=FiniteRange(0, MAX_SECONDS),
             default=default.checkpoint_every_s,
             help=f"Least seconds between two checkpoints (default: {default.checkpoint_every_s:g}).",
         ),
         click.option(
             "--checkpoint-share",
-            type=click.FloatRange(0.001, 1),
+            type=FiniteRange(0.001, 1),
             default=default.checkpoint_share,
             help=f"Largest share of the time spent on checkpoints (default: {default.checkpoint_share:g}).",
         ),
@@ -183,10 +192,10 @@ def ray_options(command: Callable) -> Callable:
         ),
         click.option(
             "--cpus-per-shard",
-            type=click.IntRange(1),
+            type=WholeNumber(1, 4096),
             help="With --ray: cores of a shard (default: this machine's; of a run that is resumed, its plan's).",
         ),
-        click.option("--gpus-per-shard", type=click.IntRange(0), help="With --ray: GPUs of a shard (default: 0)."),
+        click.option("--gpus-per-shard", type=WholeNumber(0, 1024), help="With --ray: GPUs of a shard (default: 0)."),
         click.option(
             "--resource",
             "resources",
@@ -196,14 +205,14 @@ def ray_options(command: Callable) -> Callable:
         ),
         click.option(
             "--retries",
-            type=click.IntRange(0),
+            type=WholeNumber(0, 1000),
             help="With --ray: how often a shard is retried after an application error; nodes that die do not count "
             f"(default: {default.retries}).",
         ),
         click.option(
             "--time-limit",
             "time_limit_s",
-            type=click.FloatRange(1),
+            type=FiniteRange(1, MAX_SECONDS),
             help="With --ray: kill an attempt at a shard after this many seconds; the next one resumes where it can.",
         ),
     )
@@ -211,10 +220,12 @@ def ray_options(command: Callable) -> Callable:
     def decorate(address: str | None, resources: tuple[str, ...], **others: Any) -> Any:
         names = ("cpus_per_shard", "gpus_per_shard", "retries", "time_limit_s")
         needs = {name: value for name in names if (value := others.pop(name)) is not None}
-        amounts = dict(assignment(text, "--resource") for text in resources)
+        amounts = assignments(resources, "--resource")
         for name, amount in amounts.items():
-            if isinstance(amount, bool) or not isinstance(amount, int | float) or not amount > 0:
-                raise InputError(f"--resource {name}={amount}: the amount must be a positive number")
+            if isinstance(amount, bool) or not isinstance(amount, int | float) or not 0 < amount <= _MAX_AMOUNT:
+                raise InputError(
+                    f"--resource {name}={amount}: the amount must be a positive number, at most {_MAX_AMOUNT:g}"
+                )
         ray = None if address is None else RayOptions(address=address or None, resources=amounts, **needs)
         if ray is None and (amounts or needs):
             raise InputError("--cpus-per-shard, --gpus-per-shard, --resource, --retries and --time-limit need --ray")

@@ -7,14 +7,10 @@ from typing import Any
 
 import click
 
-from uavmec_jax.cli.common import (
-    InputError,
-    Interrupt,
-    print_json,
-    print_results,
-)
+from uavmec_jax.cli.common import InputError, Interrupt, print_json, print_line, print_results
 from uavmec_jax.cli.options import directory_argument, json_option, ray_options
 from uavmec_jax.cluster.options import RayOptions
+from uavmec_jax.errors import one_line
 from uavmec_jax.runs.options import RunOptions
 
 _EVENTS = {
@@ -33,7 +29,7 @@ def event_printer(console: Any) -> Callable[[str, dict[str, Any]], None]:
 
     def print_event(event: str, facts: dict[str, Any]) -> None:
         if event in _EVENTS:
-            console.print(_EVENTS[event].format(**facts), highlight=False, soft_wrap=True)
+            console.print(one_line(_EVENTS[event].format(**facts)), highlight=False, soft_wrap=True)
 
     return print_event
 
@@ -71,15 +67,14 @@ def resume(directory: Path, ray: Any, take_over: bool, other_code: bool, as_json
     from uavmec_jax.training import host
 
     host.use_all_cores()
-    from rich.console import Console
-
+    from uavmec_jax.cli.console import new_console
     from uavmec_jax.reporting.progress import progress_bar
     from uavmec_jax.runs.folder import RunFolder
     from uavmec_jax.runs.run import resume_run
 
-    console = Console(stderr=as_json)
+    console = new_console(stderr=as_json)
     plan = RunFolder.open(directory).plan
-    console.print(f"[bold]{directory}[/bold]: {plan}", soft_wrap=True)
+    console.print_heading(str(directory), str(plan), soft_wrap=True)
     with progress_bar(console) as bar:
         bar.start(plan)
         results = resume_run(
@@ -98,8 +93,7 @@ def resume(directory: Path, ray: Any, take_over: bool, other_code: bool, as_json
 @json_option
 def status(directory: Path, as_json: bool) -> None:
     """Print the progress of the run in DIRECTORY: shards, speed, time left, disk usage."""
-    from rich.console import Console
-
+    from uavmec_jax.cli.console import new_console
     from uavmec_jax.reporting.status import status_lines
     from uavmec_jax.runs.status import run_status
 
@@ -107,8 +101,9 @@ def status(directory: Path, as_json: bool) -> None:
     if as_json:
         print_json(current.as_json())
         return
+    console = new_console()
     for line in status_lines(current):
-        Console().print(line, highlight=False, soft_wrap=True)
+        console.print(line, highlight=False, soft_wrap=True)
 
 
 def print_simulation(
@@ -123,14 +118,14 @@ def print_simulation(
     """Print how long a run would take at a given speed, and how much disk space and memory.
 
     Raises:
-        InputError: no speed is given.
+        InputError: something is trained, and no speed is given.
     """
     from uavmec_jax.cluster.connection import devices_per_shard
     from uavmec_jax.runs.run_plan import plan_run
     from uavmec_jax.runs.simulate import simulate
     from uavmec_jax.training.machine import Machine
 
-    if speed is None:
+    if speed is None and study.algorithms:
         raise InputError(
             "--simulate needs --speed, the training steps per second of one device: training_steps_per_second in the "
             "run.json of an earlier run, divided by its devices"
@@ -140,9 +135,14 @@ def print_simulation(
         machine = replace(machine, devices=devices_per_shard(ray), accelerator=ray.gpus_per_shard > 0)
     plan = plan_run(study, shard_size=shard_size, machine=machine)
     estimate = simulate(
-        study, plan, speed=speed, devices=devices or machine.devices, options=options, on_ray=ray is not None
+        study,
+        plan,
+        speed={} if speed is None else speed,
+        devices=devices or machine.devices,
+        options=options,
+        on_ray=ray is not None,
     )
     if as_json:
         print_json(estimate.as_json())
     else:
-        click.echo(f"{study.name}: {plan}\n{estimate}")
+        print_line(f"{study.name}: {plan}\n{estimate}")

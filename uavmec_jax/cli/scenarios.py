@@ -5,37 +5,41 @@ from typing import Any
 
 import click
 
-from uavmec_jax.cli.common import InputError, assignment, command_line, new_folder, print_json, print_tables
-from uavmec_jax.cli.options import Location, ScenarioChoice, json_option, out_option, scenario_options
+from uavmec_jax.cli.common import InputError, assignments, command_line, new_folder, print_json, print_tables
+from uavmec_jax.cli.options import ScenarioChoice, json_option, out_option, scenario_options
+from uavmec_jax.cli.types import Location, NameOrPath, WholeNumber, given, refuse_given
 
 _MAX_DRAWS = 10_000
 
 
 @click.command()
 @scenario_options(argument=True)
-@click.option("--draws", type=int, default=8, help="Number of volume draws to evaluate lifetimes on (default: 8).")
+@click.option(
+    "--draws",
+    type=WholeNumber(1, _MAX_DRAWS),
+    default=8,
+    help="Number of volume draws to evaluate lifetimes on (default: 8).",
+)
 @click.option(
     "--width",
-    type=int,
+    type=WholeNumber(1, 100_000),
     help="Width of the beam: the number of states it keeps (default: 256; with several UAVs or depots, 64).",
 )
 @out_option(help="Folder of the tour (default: runs/plan-<time>).")
 @json_option
 def plan(scenario: ScenarioChoice, draws: int, width: int | None, out: Path | None, as_json: bool) -> None:
     """Plan tours for SCENARIO, a file (TOML or CSV), or for a random scenario; bound, first failure, repairs."""
-    if width is not None and not 1 <= width <= 100_000:
-        raise InputError(f"--width is {width}; give 1 to 100000 states")
-    _check_draws(draws)
     from uavmec_jax.training import host
 
     host.use_all_cores()
-    from rich.console import Console
-
+    from uavmec_jax.cli.console import new_console
     from uavmec_jax.planning.plan import PLANNED_SLOTS, make_plan
     from uavmec_jax.reporting.plan import plan_data, plan_summary, plan_tables, save_plan
     from uavmec_jax.runs.results_folder import check_directory
 
     named = scenario.load()
+    if named.params.end == "horizon":
+        refuse_given("is the beam's, which is only for end = 'first_failure'", "width")
     if "max_slots" not in scenario.settings:
         named = named.with_slot_limit(PLANNED_SLOTS)
     directory = out or new_folder("plan")
@@ -45,13 +49,13 @@ def plan(scenario: ScenarioChoice, draws: int, width: int | None, out: Path | No
     if as_json:
         print_json(plan_data(result, named))
         return
-    print_tables(Console(), plan_tables(result, named), plan_summary(result, named), directory)
+    print_tables(new_console(), plan_tables(result, named), plan_summary(result, named), directory)
 
 
 @click.command()
-@click.argument("policy")
+@click.argument("policy", type=NameOrPath())
 @scenario_options(argument=False)
-@click.option("--draws", type=int, default=32, help="Number of volume draws (default: 32).")
+@click.option("--draws", type=WholeNumber(1, _MAX_DRAWS), default=32, help="Number of volume draws (default: 32).")
 @click.option("--weights", type=click.Choice(["best", "last"]), default="best", help="Which weights of a run's agent.")
 @click.option(
     "--agent",
@@ -74,34 +78,36 @@ def evaluate(
 
     From a run, the policy is by default that of the agent trained on the chosen scenario.
     """
-    _check_draws(draws)
-    from rich.console import Console
-
+    from uavmec_jax.cli.console import new_console
     from uavmec_jax.files.locations import to_path
     from uavmec_jax.reporting.compare import evaluation_table
     from uavmec_jax.scenarios.policies import TrainedPolicy, draws_scenarios, load_policy
     from uavmec_jax.studies.policy_evaluation import evaluate_policy
 
-    axes = dict(assignment(text, "--agent") for text in agent)
+    axes = assignments(agent, "--agent")
     folder = to_path(policy)
     if folder.is_dir() and scenario.file is None and not draws_scenarios(folder):
         axes = scenario.axes | axes
     chosen = load_policy(policy, weights, **axes)
+    trained = chosen if isinstance(chosen, TrainedPolicy) else None
+    if trained is None:
+        if save is not None:
+            raise InputError(f"--save {save}: {policy} is a heuristic; only trained policies are saved")
+        refuse_given(f"is only for the agents of a run, and {policy} is a heuristic", "weights", "agent")
+    elif given("weights") and weights not in (kinds := {key.split("/")[1] for key in trained.collection.weights}):
+        raise InputError(f"--weights {weights}: {policy} has only {' and '.join(sorted(kinds))} weights; leave it out")
     named = scenario.load()
     rows = evaluate_policy(chosen, folder.name, named, named.draws(draws))
-    trained = chosen if isinstance(chosen, TrainedPolicy) else None
-    if save is not None:
-        if trained is None:
-            raise InputError(f"--save {save}: {policy} is a heuristic; only trained policies are saved")
+    if save is not None and trained is not None:
         trained.save(save)
     if as_json:
         about = {"algorithm": trained.algorithm, "trained_on": dict(trained.trained_on)} if trained else {}
         head = {"command": command_line(), "scenario": str(scenario.file or scenario.axes | scenario.fleet)}
         print_json(head | about | {"policies": rows})
         return
-    console = Console()
+    console = new_console()
     measured = "Share of the horizon in service" if "service" in rows[0] else "Lifetime"
-    console.print(f"[bold]{measured} over {draws} volume draws ± 95 %[/bold]")
+    console.print(f"{measured} over {draws} volume draws ± 95 %", style="bold")
     console.print(evaluation_table(rows))
     if trained is not None:
         for line in _training_lines(trained, named, scenario):
@@ -125,9 +131,3 @@ def _training_lines(trained: Any, named: Any, scenario: ScenarioChoice) -> list[
             "This is another scenario: its observation has no positions, so the policy may not transfer to it."
         )
     return lines
-
-
-def _check_draws(draws: int) -> None:
-    """Raise an InputError unless the number of draws is in range."""
-    if not 1 <= draws <= _MAX_DRAWS:
-        raise InputError(f"--draws is {draws}; give a whole number from 1 to {_MAX_DRAWS}")

@@ -8,14 +8,17 @@ import click
 
 from uavmec_jax.cli.common import Interrupt, command_line, new_folder, print_json, print_tables
 from uavmec_jax.cli.options import json_option, out_option, ray_options
+from uavmec_jax.cli.types import NameOrPath, WholeNumber
 
 _SIGINT = 2
 
 
 @click.command()
-@click.argument("space")
+@click.argument("space", type=NameOrPath())
 @click.option(
-    "--trials", type=click.IntRange(1), help="Total number of trials; a larger number continues a finished search."
+    "--trials",
+    type=WholeNumber(1, 100_000),
+    help="Total number of trials; a larger number continues a finished search.",
 )
 @out_option(help="Folder of the search (default: runs/<space>-<time>).")
 @click.option("--no-confirm", is_flag=True, help="Skip the comparison on the study's own scenarios.")
@@ -29,8 +32,9 @@ def search(space: str, trials: int | None, out: Path | None, no_confirm: bool, r
     from uavmec_jax.training import host
 
     host.use_all_cores()
-    from rich.console import Console
+    from rich.text import Text
 
+    from uavmec_jax.cli.console import new_console
     from uavmec_jax.cluster.connection import connected
     from uavmec_jax.reporting import canvas
     from uavmec_jax.reporting.compare import comparison
@@ -40,8 +44,8 @@ def search(space: str, trials: int | None, out: Path | None, no_confirm: bool, r
     from uavmec_jax.search.space import load_space
 
     loaded = load_space(space, {"trials": trials} if trials else None)
-    directory, console = out or new_folder(loaded.name), Console(stderr=as_json)
-    console.print(f"[bold]{loaded.name}[/bold]: {loaded.trials} trials of {loaded.study}, {loaded.batch} at a time")
+    directory, console = out or new_folder(loaded.name), new_console(stderr=as_json)
+    console.print_heading(loaded.name, f"{loaded.trials} trials of {loaded.study}, {loaded.batch} at a time")
     try:
         # one connection for the search and its two runs
         with console.status("compiling") as line, connected(ray):
@@ -50,7 +54,7 @@ def search(space: str, trials: int | None, out: Path | None, no_confirm: bool, r
                 directory,
                 command=command_line(),
                 ray=ray,
-                on_progress=lambda progress: line.update(_describe(progress)),
+                on_progress=lambda progress: line.update(Text(_describe(progress))),
             )
             for name, figure in (("history", history_figure(result)), ("importance", importance_figure(result))):
                 canvas.save(figure, directory / f"{name}.png")

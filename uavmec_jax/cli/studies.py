@@ -1,13 +1,22 @@
 """Commands about studies and their results."""
 
+import json
 from pathlib import Path
 from typing import Any
 
 import click
 
-from uavmec_jax.cli.common import assignment, command_line, new_folder, print_json, print_results, print_tables
+from uavmec_jax.cli.common import (
+    InputError,
+    assignments,
+    command_line,
+    new_folder,
+    print_json,
+    print_line,
+    print_results,
+    print_tables,
+)
 from uavmec_jax.cli.options import (
-    FolderOfRun,
     directory_argument,
     json_option,
     ray_options,
@@ -16,15 +25,23 @@ from uavmec_jax.cli.options import (
     set_option,
 )
 from uavmec_jax.cli.runs import event_printer, print_simulation, report_results
+from uavmec_jax.cli.types import FiniteRange, FolderOfRun, NameOrPath, WholeNumber, refuse_given
+from uavmec_jax.errors import printable
 from uavmec_jax.runs.options import RunOptions
 
 QUICK_STEPS, QUICK_SEEDS, QUICK_VALIDATE_EVERY = 50_000, 3, 5_000
 
+_NOT_SIMULATED = ("out", "tensorboard", "resources", "retries", "time_limit_s")
+"""Options of `run` that an estimate does not depend on."""
+
+_OF_TRAINING = ("steps", "checkpoint", "checkpoint_every_s", "checkpoint_share", "tensorboard", "speed")
+"""Options of `run` that a study without training does not depend on."""
+
 
 @click.command()
-@click.argument("study")
-@click.option("--seeds", type=int, help="Number of seeds (axes.seeds).")
-@click.option("--steps", type=int, help="Environment steps per agent.")
+@click.argument("study", type=NameOrPath())
+@click.option("--seeds", type=WholeNumber(1, 2**31 - 1), help="Number of seeds (axes.seeds).")
+@click.option("--steps", type=WholeNumber(1, 2_000_000_000), help="Environment steps per agent.")
 @click.option(
     "--quick", is_flag=True, help=f"{QUICK_SEEDS} seeds x {QUICK_STEPS:,} steps: first results within a minute."
 )
@@ -34,8 +51,12 @@ QUICK_STEPS, QUICK_SEEDS, QUICK_VALIDATE_EVERY = 50_000, 3, 5_000
 @run_options
 @ray_options
 @click.option("--simulate", is_flag=True, help="Estimate wall time, disk space and memory, and run nothing.")
-@click.option("--speed", type=float, help="For --simulate: training steps per second of one device.")
-@click.option("--devices", type=int, help="For --simulate: number of devices (default: those of this machine).")
+@click.option(
+    "--speed", type=FiniteRange(0.001, 1e12), help="With --simulate: training steps per second of one device."
+)
+@click.option(
+    "--devices", type=WholeNumber(1, 1_000_000), help="With --simulate: number of devices (default: this machine's)."
+)
 def run(
     study: str,
     seeds: int | None,
@@ -53,19 +74,24 @@ def run(
 ) -> None:
     """Train and evaluate STUDY: one that ships with the package (table5, table6, table7, planning, ...) or a TOML file."""
     overrides = _overrides(quick, seeds, steps, settings)
+    if simulate:
+        refuse_given("has no meaning with --simulate, which runs nothing", *_NOT_SIMULATED)
+    else:
+        refuse_given("is only for --simulate", "speed", "devices")
 
     from uavmec_jax.training import host
 
     host.use_all_cores()
-    from rich.console import Console
-
+    from uavmec_jax.cli.console import new_console
     from uavmec_jax.reporting.progress import progress_bar
     from uavmec_jax.runs.results_folder import check_directory
     from uavmec_jax.runs.run import run_study
     from uavmec_jax.studies.study import load_study
 
-    console = Console(stderr=as_json)
+    console = new_console(stderr=as_json)
     resolved = load_study(study, overrides)
+    if not resolved.algorithms:
+        refuse_given(f"is about training, and {resolved.name} trains nothing", *_OF_TRAINING)
     if simulate:
         print_simulation(resolved, speed, devices, shard_size, ray, RunOptions(**options), as_json)
         return
@@ -74,7 +100,7 @@ def run(
     with progress_bar(console) as bar:
 
         def on_plan(plan: Any) -> None:
-            console.print(f"[bold]{resolved.name}[/bold]: {plan}")
+            console.print_heading(resolved.name, str(plan))
             bar.start(plan)
 
         results = run_study(
@@ -102,7 +128,11 @@ def _overrides(quick: bool, seeds: int | None, steps: int | None, settings: tupl
             "evaluation.planner_draws": 1,
         }
     overrides |= {name: value for name, value in (("axes.seeds", seeds), ("steps", steps)) if value is not None}
-    return overrides | dict(assignment(setting) for setting in settings)
+    changes = assignments(settings)
+    for option, name, value in (("--seeds", "axes.seeds", seeds), ("--steps", "steps", steps)):
+        if value is not None and name in changes:
+            raise InputError(f"{option} is {value}, and --set {name} is given too; leave one of them out")
+    return overrides | changes
 
 
 @click.command()
@@ -110,12 +140,11 @@ def _overrides(quick: bool, seeds: int | None, steps: int | None, settings: tupl
 @json_option
 def show(directory: Path, as_json: bool) -> None:
     """Print the tables of the run in DIRECTORY."""
-    from rich.console import Console
-
+    from uavmec_jax.cli.console import new_console
     from uavmec_jax.runs.results_folder import load_results
 
     results = load_results(directory)
-    print_results(results, directory, Console(stderr=as_json), as_json)
+    print_results(results, directory, new_console(stderr=as_json), as_json)
 
 
 @click.command()
@@ -136,23 +165,24 @@ def compare(
     as_json: bool,
 ) -> None:
     """Compare RUN_A with RUN_B seed by seed: paired differences, interquartile means, probability of improvement."""
-    from rich.console import Console
+    of_a, of_b = assignments(where_a, "--a"), assignments(where_b, "--b")
 
+    from uavmec_jax.cli.console import new_console
     from uavmec_jax.reporting.compare import comparison
     from uavmec_jax.runs.results_folder import load_results
     from uavmec_jax.studies.compare import Side
 
-    a = Side(load_results(run_a), policy_a, dict(assignment(text, "--a") for text in where_a))
-    b = Side(load_results(run_b), policy_b, dict(assignment(text, "--b") for text in where_b))
+    a = Side(load_results(run_a), policy_a, of_a)
+    b = Side(load_results(run_b), policy_b, of_b)
     tables, data = comparison(a, b)
     if as_json:
         print_json({"command": command_line(), **data})
         return
-    print_tables(Console(), tables, [])
+    print_tables(new_console(), tables, [])
 
 
 @click.command()
-@click.argument("file")
+@click.argument("file", type=NameOrPath())
 @click.option("--json", "as_json", is_flag=True, help="Print the resolved study as JSON.")
 def validate(file: str, as_json: bool) -> None:
     """Check the study FILE (or a shipped study) without running it."""
@@ -163,6 +193,6 @@ def validate(file: str, as_json: bool) -> None:
     study = load_study(file)
     load_evacuations(study)
     if as_json:
-        click.echo(study.model_dump_json(indent=1))
+        print_json(json.loads(study.model_dump_json()))
     else:
-        click.echo(f"{file}: a valid study: {n_agents(study):,} agents x {study.steps:,} steps")
+        print_line(f"{printable(file)}: a valid study: {n_agents(study):,} agents x {study.steps:,} steps")

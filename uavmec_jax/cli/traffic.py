@@ -7,8 +7,16 @@ from typing import Any
 
 import click
 
-from uavmec_jax.cli.common import InputError, assignment, command_line, print_json
-from uavmec_jax.cli.options import json_option, set_option
+from uavmec_jax.cli.common import InputError, assignments, command_line, print_json, print_line
+from uavmec_jax.cli.options import MAX_DEVICES, MAX_SEED, json_option, set_option
+from uavmec_jax.cli.types import LocalPath, NameOrPath, WholeNumber, refuse_given
+from uavmec_jax.errors import printable
+
+_TABLES = ("network", "demand", "simulation", "devices")
+"""Tables of a place that ``--set`` changes."""
+
+_PLACEMENT = ("count", "corridor_share", "span_m")
+"""Settings of the table ``devices`` that place devices which no file lists."""
 
 
 @click.group()
@@ -23,21 +31,21 @@ def traffic() -> None:
 
 
 @traffic.command()
-@click.argument("place", required=False)
-@click.option("--osm", type=click.Path(path_type=Path), help="OpenStreetMap extract: .osm, .osm.gz or .osm.bz2.")
+@click.argument("place", required=False, type=NameOrPath())
+@click.option("--osm", type=LocalPath(), help="OpenStreetMap extract: .osm, .osm.gz or .osm.bz2.")
 @click.option("--bbox", metavar="W,S,E,N", help="Bounding box to cut from the extract, in degrees.")
-@click.option("--net", type=click.Path(path_type=Path), help="SUMO network, .net.xml.")
-@click.option("--devices", type=click.Path(path_type=Path), help="TOML file with a [[device]] table for each device.")
+@click.option("--net", type=LocalPath(), help="SUMO network, .net.xml.")
+@click.option("--devices", type=LocalPath(), help="TOML file with a [[device]] table for each device.")
 @click.option(
     "--origin", "origins", multiple=True, metavar="ROAD", help="Road where trips start (default: residential roads)."
 )
 @click.option(
     "--exit", "exits", multiple=True, metavar="NAME[=WEIGHT]", help="Where trips end (default: ends of highways)."
 )
-@click.option("--vehicles", type=int, help="Number of vehicles to evacuate.")
-@click.option("--seeds", type=int, help="Number of simulations to average.")
+@click.option("--vehicles", type=WholeNumber(1, 1_000_000), help="Number of vehicles to evacuate.")
+@click.option("--seeds", type=WholeNumber(1, 1000), help="Number of simulations to average.")
 @set_option(help="Override any setting, e.g. --set demand.warm_up_s=300.0.")
-@click.option("--out", type=click.Path(path_type=Path), help="File of the evacuation (default: <place>.npz).")
+@click.option("--out", type=LocalPath(), help="File of the evacuation (default: <place>.npz).")
 @json_option
 def build(
     place: str | None,
@@ -58,8 +66,9 @@ def build(
         raise InputError("give one of PLACE, --osm FILE and --net FILE")
     if bbox is not None and osm is None:
         raise InputError(f"--bbox {bbox}: cuts an OpenStreetMap extract; give --osm too")
-    from rich.console import Console
+    from rich.text import Text
 
+    from uavmec_jax.cli.console import new_console
     from uavmec_jax.traffic.build import build_evacuation
     from uavmec_jax.traffic.place import load_place, make_place
 
@@ -70,26 +79,47 @@ def build(
         source = osm or net
         assert source is not None
         network = {"osm" if osm else "net": str(source.absolute())} | ({"bbox": _box(bbox)} if bbox else {})
-        name = re.sub("[^A-Za-z0-9]+", "-", source.name.split(".")[0]).strip("-") or "place"
+        name = re.sub("[^A-Za-z0-9]+", "-", source.name.split(".")[0]).strip("-")[:80] or "place"
+        for setting in changes.pop("network", {}):
+            raise InputError(f"--set network.{setting}: {'--osm' if osm else '--net'} gives the network; leave it out")
         resolved, folder = make_place({"name": name, "network": network} | changes, str(source)), Path()
+    for setting in changes.get("devices", {}) if resolved.device else ():
+        if setting in _PLACEMENT:
+            raise InputError(f"--set devices.{setting}: is for devices that no file lists, and one does; leave it out")
     target = _target(out or Path(f"{resolved.name}.npz"))
-    console = Console(stderr=True)
-    with console.status("starting") as status:
-        evacuation = build_evacuation(resolved, folder, command=command_line(), on_progress=status.update)
+    with new_console(stderr=True).status("starting") as status:
+        evacuation = build_evacuation(
+            resolved, folder, command=command_line(), on_progress=lambda line: status.update(Text(line))
+        )
     evacuation.save(target)
     _print(evacuation, str(target), as_json)
 
 
 @traffic.command()
-@click.argument("source")
-@click.option("--figure", type=click.Path(path_type=Path), help="Draw the road map (.png, .svg or .pdf).")
-@click.option("--animation", type=click.Path(path_type=Path), help="Draw one evacuation slot by slot (.gif).")
+@click.argument("source", type=NameOrPath())
+@click.option("--figure", type=LocalPath(), help="Draw the road map (.png, .svg or .pdf).")
+@click.option("--animation", type=LocalPath(), help="Draw one evacuation slot by slot (.gif).")
 @click.option(
-    "--policy", default="earliest-deadline", help="Name or file of the policy to animate (default: earliest-deadline)."
+    "--policy",
+    type=NameOrPath(),
+    default="earliest-deadline",
+    help="Name or file of the policy to animate (default: earliest-deadline).",
 )
-@click.option("--powered", type=int, default=8, help="Number of devices with grid power to animate (default: 8).")
-@click.option("--connected", type=int, default=6, help="Number of devices with communication to animate (default: 6).")
-@click.option("--seed", type=int, default=0, help="Seed of hardware, power, communication and task volumes.")
+@click.option(
+    "--powered",
+    type=WholeNumber(0, MAX_DEVICES),
+    default=8,
+    help="Number of devices with grid power to animate (default: 8).",
+)
+@click.option(
+    "--connected",
+    type=WholeNumber(0, MAX_DEVICES),
+    default=6,
+    help="Number of devices with communication to animate (default: 6).",
+)
+@click.option(
+    "--seed", type=WholeNumber(0, MAX_SEED), default=0, help="Seed of hardware, power, communication and task volumes."
+)
 @json_option
 def show(
     source: str,
@@ -102,6 +132,8 @@ def show(
     as_json: bool,
 ) -> None:
     """Show the devices and their traffic in SOURCE, the file of an evacuation or a place that ships with the package."""
+    if animation is None:
+        refuse_given("is only for --animation", "policy", "powered", "connected", "seed")
     from uavmec_jax.traffic.evacuation import load_evacuation
 
     evacuation = load_evacuation(source)
@@ -127,20 +159,19 @@ def show(
         written.append(animation)
     _print(evacuation, source, as_json)
     for path in written:
-        click.echo(f"File: {path}", err=as_json)
+        print_line(printable(f"File: {path}"), err=as_json)
 
 
 def _print(evacuation: Any, source: str, as_json: bool) -> None:
     """Print the devices of an evacuation as a table or as JSON."""
-    from rich.console import Console
-
+    from uavmec_jax.cli.console import new_console
     from uavmec_jax.reporting.evacuation import evacuation_data, evacuation_lines, evacuation_table
 
     if as_json:
         print_json(evacuation_data(evacuation))
         return
-    console = Console()
-    console.print(f"[bold]{evacuation.name}[/bold]: {evacuation.meta['description']}", highlight=False)
+    console = new_console()
+    console.print_heading(evacuation.name, evacuation.meta["description"])
     console.print(evacuation_table(evacuation))
     for line in evacuation_lines(evacuation):
         console.print(line, highlight=False)
@@ -161,22 +192,36 @@ def _changes(
     from uavmec_jax.files.parsing import parse_toml
     from uavmec_jax.files.reading import read_text
 
-    demand = {"origins": origins or None, "exits": dict(map(_exit, exits)) or None, "vehicles": vehicles}
+    demand = {"origins": origins or None, "exits": _exits(exits) or None, "vehicles": vehicles}
     tables: dict[str, dict[str, Any]] = {"demand": demand, "simulation": {"seeds": seeds}}
     changes: dict[str, Any] = {
         table: {name: value for name, value in options.items() if value is not None}
         for table, options in tables.items()
     }
-    for dotted, value in map(assignment, settings):
+    for dotted, value in assignments(settings).items():
         table, _, name = dotted.partition(".")
-        if not name:
-            raise InputError(f"--set {dotted}: name a table and a setting, e.g. demand.vehicles=2000")
+        if table not in _TABLES or not name:
+            raise InputError(
+                f"--set {dotted}: name a table and a setting, e.g. demand.vehicles=2000; tables: {', '.join(_TABLES)}"
+            )
+        if name in changes.get(table, {}):
+            raise InputError(f"--set {dotted}: an option gives it too; leave one of them out")
         changes.setdefault(table, {})[name] = value
     if devices is not None:
         changes["device"] = parse_toml(read_text(devices, TrafficError), devices, TrafficError).get("device", [])
         if not changes["device"]:
             raise InputError(f"{devices}: holds no [[device]] tables")
     return changes
+
+
+def _exits(texts: tuple[str, ...]) -> dict[str, Any]:
+    """Parse the options ``--exit``."""
+    weights = dict(map(_exit, texts))
+    if len(weights) < len(texts):
+        names = [_exit(text)[0] for text in texts]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"--exit {twice}: is given twice; give it once")
+    return weights
 
 
 def _exit(text: str) -> tuple[str, Any]:

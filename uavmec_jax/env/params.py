@@ -16,6 +16,17 @@ from uavmec_jax.errors import ArgumentError
 MAX_DEVICES = 1000
 """Largest number of devices in a scenario."""
 
+LEAST, MOST = 1e-6, 1e12
+"""Bounds of quantities in SI units: far beyond any device or UAV, and products of a few of them are still float32."""
+
+LEAST_CAPACITY_J = 1e-3
+"""Smallest capacity of a device's battery."""
+
+MAX_LENGTH_M = 1e7
+"""Largest side of a region, altitude and signal range, m: beyond it, squares of distances lose their metres in float32."""
+
+_POSITIVE, _NOT_NEGATIVE = {"ge": LEAST, "le": MOST}, {"ge": 0, "le": MOST}
+
 ENDS = ("first_failure", "horizon")
 """What ends an episode. ``first_failure``: an empty battery, expired data or the UAVs' batteries, as in the paper.
 ``horizon``: a time or a share of the devices with empty batteries; devices fail one by one, and the others go on."""
@@ -30,29 +41,29 @@ class Params:
     interpretations where the paper is ambiguous; ``docs/model.md`` explains each.
     """
 
-    uav_speed_m_s: Scalar = struct.field(default=5.0, metadata={"gt": 0})
-    uav_flying_power_w: Scalar = 150.0
-    uav_hovering_power_w: Scalar = struct.field(default=80.0, metadata={"gt": 0})
-    uav_signal_range_m: Scalar = struct.field(default=65.0, metadata={"gt": 0})
+    uav_speed_m_s: Scalar = struct.field(default=5.0, metadata=_POSITIVE)
+    uav_flying_power_w: Scalar = struct.field(default=150.0, metadata=_NOT_NEGATIVE)
+    uav_hovering_power_w: Scalar = struct.field(default=80.0, metadata=_POSITIVE)
+    uav_signal_range_m: Scalar = struct.field(default=65.0, metadata={"ge": LEAST, "le": MAX_LENGTH_M})
     """Largest slant distance, which includes the altitude, at which a device is served."""
-    uav_altitude_m: Scalar = 10.0
-    uav_battery_j: Scalar = struct.field(default=1_600_000.0, metadata={"gt": 0})
+    uav_altitude_m: Scalar = struct.field(default=10.0, metadata={"ge": 0, "le": MAX_LENGTH_M})
+    uav_battery_j: Scalar = struct.field(default=1_600_000.0, metadata=_POSITIVE)
     n_devices: int = struct.field(pytree_node=False, default=12, metadata={"ge": 2, "le": MAX_DEVICES})
     """Number of devices; as a setting at least 2. A scenario file, whose devices are counted, may hold a single one."""
-    bandwidth_hz: Scalar = struct.field(default=20e6, metadata={"gt": 0})
+    bandwidth_hz: Scalar = struct.field(default=20e6, metadata=_POSITIVE)
     noise_power_dbm: Scalar = struct.field(default=-100.0, metadata={"ge": -300, "le": 300})
     reference_gain_db_at_1m: Scalar = struct.field(default=-50.0, metadata={"ge": -300, "le": 300})
-    path_loss_exponent: Scalar = struct.field(default=4.0, metadata={"gt": 0})
-    transmit_power_w: Scalar = struct.field(default=0.1, metadata={"gt": 0})
+    path_loss_exponent: Scalar = struct.field(default=4.0, metadata={"ge": 0.1, "le": 10})
+    transmit_power_w: Scalar = struct.field(default=0.1, metadata=_POSITIVE)
     device_battery_range_j: Range = (50_000.0, 80_000.0)
     task_volume_range_bytes: Range = (2e6, 4e6)
     data_age_limit_slots: Scalar = struct.field(default=10, metadata={"ge": 0, "le": 250})
-    slot_cap_s: Scalar = struct.field(default=600.0, metadata={"gt": 0})
+    slot_cap_s: Scalar = struct.field(default=600.0, metadata=_POSITIVE)
     """Longest local processing time in a slot; work beyond it is dropped."""
     region_m: Range = (800.0, 800.0)
-    result_message_bytes: Scalar = 1000.0
+    result_message_bytes: Scalar = struct.field(default=1000.0, metadata=_NOT_NEGATIVE)
 
-    uplink_rate_bit_s: Scalar = struct.field(default=math.inf, metadata={"gt": 0})
+    uplink_rate_bit_s: Scalar = struct.field(default=math.inf, metadata={"ge": LEAST})
     """Rate at which connected devices that are not served send their results (not in the paper)."""
     flight_power_adds_to_hover: Scalar = False
     """Whether a slot of length T costs the UAV ``fly * t_fly + hover * T``, not ``fly * t_fly + hover * (T - t_fly)``."""
@@ -64,7 +75,7 @@ class Params:
     """Time limit of an episode (truncation), far beyond what the UAV's battery allows with the paper's parameters."""
     end: str = struct.field(pytree_node=False, default="first_failure", metadata={"choices": ENDS})
     """What ends an episode; see :data:`ENDS`."""
-    horizon_s: Scalar = struct.field(default=43_200.0, metadata={"gt": 0})
+    horizon_s: Scalar = struct.field(default=43_200.0, metadata=_POSITIVE)
     """Seconds after which an episode ends, if ``end`` is ``horizon``."""
     end_share: Scalar = struct.field(default=1.0, metadata={"gt": 0, "le": 1})
     """Share of the devices with an empty battery at which an episode ends, if ``end`` is ``horizon``."""

@@ -50,7 +50,7 @@ def progress_bar(console: Console) -> Iterator[RunBar]:
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[detail]}"),
+        TextColumn("{task.fields[detail]}", markup=False),
     )
     with rich_progress.Progress(*columns, console=console) as bar:
         yield RunBar(bar)

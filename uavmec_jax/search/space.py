@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import math
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -17,11 +16,15 @@ from uavmec_jax.errors import StudyError
 from uavmec_jax.files.parsing import parse_toml
 from uavmec_jax.files.reading import read_text
 from uavmec_jax.files.validation import StrictModel, describe_error, expectation, from_array, suggest
+from uavmec_jax.studies.axes import MAX_WEIGHT
 from uavmec_jax.studies.population import seeds_of
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.studies.study import load_study
 
 _LIBRARY = resources.files("uavmec_jax.search") / "library"
+
+_MOST = 1e30
+"""Largest number in a range: still a number in float32."""
 
 REWARD = "reward."
 """Prefix of the reward's terms among the settings."""
@@ -59,6 +62,12 @@ class Halving(StrictModel):
     """Shares of the training after which the worst trials are pruned; by default no trial is pruned."""
     keep: Annotated[float, Field(gt=0, lt=1)] = 0.5
     """Share of the trials that continue."""
+
+    @pydantic.model_validator(mode="after")
+    def _check(self) -> "Halving":
+        if any(later <= earlier for earlier, later in itertools.pairwise(self.rungs)):
+            raise ValueError(f"halving.rungs is {self.rungs}; give rising shares, each once")
+        return self
 
 
 class Space(StrictModel):
@@ -133,6 +142,8 @@ def load_space(name_or_path: str, overrides: Mapping[str, Any] | None = None) ->
 
 def _check(source: str, space: Space) -> None:
     """Raise a StudyError unless every setting can be searched and the scenarios are not those that the study reports."""
+    if not space.space:
+        raise StudyError(f"{source}: space is empty; give at least one setting to search, e.g. learning_rate")
     study = space.base()
     name = study.algorithms[0]
     declared, settings = ALGORITHMS[name], getattr(study, name)
@@ -143,9 +154,13 @@ def _check(source: str, space: Space) -> None:
             raise StudyError(f"{where} is not a setting of {name}; {suggest(key, names)}")
         if isinstance(values, Range):
             _check_range(where, key, values, declared.static)
+        elif repeated := [value for k, value in enumerate(values.choices) if value in values.choices[:k]]:
+            raise StudyError(f"{where} has {repeated[0]!r} twice among its choices; give each once")
         for value in boundary_values(values):
             if not key.startswith(REWARD):
                 _check_value(where, type(settings), key, value)
+            elif isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= MAX_WEIGHT:
+                raise StudyError(f"{where} has {value!r}; give numbers from {-MAX_WEIGHT:g} to {MAX_WEIGHT:g}")
     scenarios = space.validation
     reported = set(seeds_of(study)) & set(range(scenarios.first_seed, scenarios.first_seed + scenarios.seeds))
     if reported:
@@ -163,8 +178,8 @@ def _check(source: str, space: Space) -> None:
 def _check_range(where: str, key: str, values: Range, static: tuple[str, ...]) -> None:
     if key in static:
         raise StudyError(f"{where} has low and high, but shapes the program; give choices = [...]")
-    if not (math.isfinite(values.low) and math.isfinite(values.high) and values.low < values.high):
-        raise StudyError(f"{where} has low {values.low} and high {values.high}; give low < high")
+    if not -_MOST <= values.low < values.high <= _MOST:
+        raise StudyError(f"{where} has low {values.low} and high {values.high}; give low < high, at most {_MOST:g}")
     if values.log and values.low <= 0:
         raise StudyError(f"{where} has low {values.low} and log = true; give low > 0")
 

@@ -1,7 +1,6 @@
 """The axes of a study and the values that they may have."""
 
 import dataclasses
-import math
 from typing import Any
 
 import pydantic
@@ -23,6 +22,9 @@ TRACED_PARAMS = tuple(
 TRAFFIC_WEIGHTS = ("traffic_bonus", "traffic_penalty")
 """Settings that weigh traffic in the reward."""
 
+MAX_WEIGHT = 1e9
+"""Largest weight in a reward."""
+
 _OTHER_AXES = (
     *("powered", "connected", "cells", "seeds", "algorithm", "reward", "guard", "place", *TRAFFIC_WEIGHTS),
     *("uavs", "depots"),
@@ -39,10 +41,12 @@ def check_reward(where: str, reward: Any) -> None:
         if reward not in REWARDS:
             raise ValueError(f"{where} is {reward!r}, which is not a reward; {suggest(reward, REWARDS)}")
     else:
-        for term in reward:
+        for term, weight in reward.items():
             if term not in (*TERMS, SERVICE_TERM):
                 known = suggest(term, (*TERMS, SERVICE_TERM))
                 raise ValueError(f"{where} has the term {term!r}, which is not one; {known}")
+            if not abs(weight) <= MAX_WEIGHT:
+                raise ValueError(f"{where}.{term} is {weight}; give a number from {-MAX_WEIGHT:g} to {MAX_WEIGHT:g}")
 
 
 def traced_settings(study: Any) -> tuple[str, ...]:
@@ -138,7 +142,7 @@ def _expected(study: Any, name: str, value: Any) -> str:
         case "place":
             fits, expected = isinstance(value, str) and value != "", "give names of places or paths of their files"
         case "traffic_bonus" | "traffic_penalty":
-            fits, expected = is_number and 0 <= value < math.inf, "give finite numbers from 0"
+            fits, expected = is_number and 0 <= value <= MAX_WEIGHT, f"give numbers from 0 to {MAX_WEIGHT:g}"
         case _:
             return _expected_setting(study, name, value)
     return "" if fits else expected

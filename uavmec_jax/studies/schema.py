@@ -21,7 +21,7 @@ from uavmec_jax.scenarios.distribution import ScenarioSettings, check_scenarios
 from uavmec_jax.scenarios.inventory import check_depots
 from uavmec_jax.scenarios.schema import DepotSettings, label
 from uavmec_jax.scenarios.settings import ParamsSettings, check_ranges
-from uavmec_jax.studies.axes import TRAFFIC_WEIGHTS, check_axes, check_reward, expected_depots
+from uavmec_jax.studies.axes import MAX_WEIGHT, TRAFFIC_WEIGHTS, check_axes, check_reward, expected_depots
 
 
 def _algorithm_settings(name: str) -> Any:
@@ -41,12 +41,19 @@ AlgorithmName: Any = Literal[(*ALGORITHMS, "none")]
 Guard: Any = Literal[LOG_GUARDS]
 Heuristic: Any = Literal[tuple(FLEET_HEURISTICS)]
 
+_RewardWeight = Annotated[float, Field(ge=0, le=MAX_WEIGHT)]
+
 Planner = Literal["rollout", "beam", "bound"]
 PLANNERS: tuple[Planner, ...] = get_args(Planner)
 """In the order of their lifetimes: without knowledge of the future, clairvoyant, and the upper bound on every policy."""
 
 CLAIRVOYANT: tuple[Planner, ...] = ("beam", "bound")
 """Those that know the volumes in advance."""
+
+
+def _planner_draws(settings: dict[str, Any]) -> int:
+    """Return the default number of draws that planners are evaluated on."""
+    return min(8, settings.get("draws", 8))
 
 
 class Evaluation(StrictModel):
@@ -61,13 +68,21 @@ class Evaluation(StrictModel):
     """Heuristics that are evaluated on the same draws as the trained policies."""
     planners: Annotated[tuple[Planner, ...], from_array] = PLANNERS
     """Planners and the bound, which show how far policies are from the optimum; see ``docs/planning.md``."""
-    planner_draws: Annotated[int, Field(ge=1, le=10_000)] = 8
-    """Number of held-out draws, from the first on, that planners are evaluated on (all of them if there are fewer)."""
+    planner_draws: Annotated[int, Field(ge=1, le=10_000)] = Field(default_factory=_planner_draws)
+    """Number of held-out draws, from the first on, that planners are evaluated on; by default 8, or all if they are fewer."""
     clairvoyant_seeds: Annotated[tuple[Annotated[int, Field(ge=0)], ...] | None, from_array] = None
     """Numbers of seeds, from the first on, that beam and bound are evaluated on, which take longest: that for one UAV, for
     two, and so on; the last number holds for more UAVs. By default, all seeds."""
     rollout_samples: Annotated[int, Field(ge=1, le=1000)] = ROLLOUT_SAMPLES
     beam_width: Annotated[int, Field(ge=1, le=100_000)] = BEAM_WIDTH
+
+    @pydantic.model_validator(mode="after")
+    def _check(self) -> "Evaluation":
+        if self.planner_draws > self.draws:
+            raise ValueError(
+                f"evaluation.planner_draws is {self.planner_draws}; give at most evaluation.draws, which is {self.draws}"
+            )
+        return self
 
 
 class StudyDepot(DepotSettings):
@@ -90,15 +105,15 @@ class Study(StrictModel):
     """Environment steps of one agent."""
     place: str = ""
     """A place whose evacuation was simulated, by name or file; if empty, positions are random and traffic is unknown."""
-    place_scale_m: Annotated[float, Field(gt=0)] | None = None
+    place_scale_m: Annotated[float, Field(ge=1, le=1e7)] | None = None
     """Length to which the longer side of a place is scaled (800 in the paper); by default distances are real."""
     traffic: Literal["static", "moving"] = "static"
     """Whether a device's traffic weight is its mean over the evacuation, or that of the present window."""
-    traffic_bonus: Annotated[float, Field(ge=0)] = 0.0
+    traffic_bonus: _RewardWeight = 0.0
     """Added to the reward when a device is visited, times its traffic weight."""
-    traffic_penalty: Annotated[float, Field(ge=0)] = 0.0
+    traffic_penalty: _RewardWeight = 0.0
     """Subtracted from the reward when a device is the first to fail, times its traffic weight."""
-    slot_reward: Annotated[float, Field(ge=0)] = 0.0
+    slot_reward: _RewardWeight = 0.0
     """Added to the reward for every slot that counts toward the lifetime."""
     scenarios: ScenarioSettings | None = None
     """Distribution from which every episode draws a scenario; it replaces the axes ``powered`` and ``connected``."""
