@@ -59,8 +59,8 @@ def run(
     host.use_all_cores()
     from rich.console import Console
 
+    from uavmec_jax.files.output_folders import check_directory
     from uavmec_jax.reporting.progress import progress_bar
-    from uavmec_jax.runs.results_folder import check_directory
     from uavmec_jax.runs.run import run_study
     from uavmec_jax.studies.study import load_study
 
