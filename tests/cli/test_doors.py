@@ -14,6 +14,14 @@ from uavmec_jax.runs.results_folder import load_results
 
 DEVICES = "name,x,y,power,comms\nmill,10,10,yes,yes\nferry,{x},80,no,yes\n"
 
+IN_ONE_SECOND = """
+import types
+from uavmec_jax.cli import common, main
+common.time = types.SimpleNamespace(strftime=lambda form: "now")
+main()
+"""
+"""The command, in whose default folders it is always the same time."""
+
 
 def start(*arguments, cwd):
     """Start a command as the console script `uavmec` does: with no working folder on Python's path."""
@@ -60,11 +68,9 @@ def test_planted_modules_do_not_run_in_the_workers_of_ray(tmp_path):
 def test_two_plans_in_one_second_get_two_whole_folders(tmp_path):
     for name, x in (("a", 60), ("b", 90)):
         (tmp_path / f"{name}.csv").write_text(DEVICES.format(x=x))
-    # both get to their folder in the same second: the time in its name is that of the test
-    clock = "import time, sys; time.strftime = lambda form: 'now'; from uavmec_jax.cli import main; main(sys.argv[1:])"
     plans = [
         subprocess.Popen(
-            [sys.executable, "-P", "-c", clock, "plan", file, "--draws", "1", "--width", "2"],
+            [sys.executable, "-P", "-c", IN_ONE_SECOND, "plan", file, "--draws", "1", "--width", "2"],
             cwd=tmp_path,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
