@@ -28,7 +28,7 @@ INSIDE_FUNCTIONS = {
     "interop.five_values": ("gymnax.environments",),  # the caller's library
     "cluster.local": ("ray",),  # of the extra `ray`
     "cluster.worker": ("ray",),  # of the extra `ray`
-    "search.search": ("sqlalchemy", "sqlalchemy.exc"),  # of the extra `search`
+    "search.folder": ("sqlalchemy", "sqlalchemy.exc"),  # of the extra `search`
     "traffic.worker": ("libsumo",),  # of the extra `traffic`
 }
 """Modules with imports inside functions, beside `cli`, where they are for the sake of the start-up time."""
@@ -63,6 +63,28 @@ def test_env_is_pure_jax():
         if room_of(module) == "env":
             names = {node.id for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.Name)}
             assert "open" not in names, module
+
+
+def test_processes_of_ours_never_import_from_the_folder_that_they_start_in():
+    """Every command that starts Python goes on with -P, or -I where the standard library is enough."""
+    started = 0
+    for module, file in MODULES.items():
+        tree = ast.parse(file.read_text())
+        names = [node for node in ast.walk(tree) if isinstance(node, ast.Attribute) and node.attr == "executable"]
+        commands = [
+            node.elts
+            for node in ast.walk(tree)
+            if isinstance(node, ast.List) and any(element in names for element in node.elts)
+        ]
+        assert len(commands) == len(names), f"{module}: sys.executable is used outside a list of arguments"
+        for python, option, *_ in commands:
+            assert python in names, module
+            assert isinstance(option, ast.Constant), module
+            assert option.value in ("-P", "-I"), module
+        started += len(commands)
+        imported = {one.imported.split(".")[0] for one in IMPORTS if one.importer == module}
+        assert not {"multiprocessing", "runpy"} & imported, module
+    assert started >= 3
 
 
 def test_imports_inside_functions_are_listed():

@@ -6,7 +6,8 @@ import pytest
 
 from tests.runs.processes import TINY
 from uavmec_jax.errors import StudyError
-from uavmec_jax.runs.results_folder import check_directory, load_results
+from uavmec_jax.files.output_folders import check_directory
+from uavmec_jax.runs.results_folder import load_results
 from uavmec_jax.runs.run import resume_run, run_study
 from uavmec_jax.runs.status import run_status
 from uavmec_jax.studies.study import parse_study

@@ -10,9 +10,10 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from uavmec_jax.errors import PolicyError, StudyError
+from uavmec_jax.files.output_folders import check_directory
 from uavmec_jax.reporting import canvas, figures, tables
 from uavmec_jax.reporting.summary import summary
-from uavmec_jax.runs.results_folder import check_directory, load_results
+from uavmec_jax.runs.results_folder import load_results
 from uavmec_jax.runs.run import resume_run, run_study
 from uavmec_jax.runs.run_plan import BYTES_WITHOUT_TRAINING, plan_run
 from uavmec_jax.studies.results_files import load_weights

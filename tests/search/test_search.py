@@ -86,7 +86,7 @@ def test_a_stopped_search_continues_to_the_same_result(space, tmp_path):
     assert again.results.agents.shape == baseline.results.agents.shape
 
     (tmp_path / "whole" / "trials.db").write_bytes(b"SQLite no more" * 1000)
-    with pytest.raises(StudyError, match=r"trials.db: cannot be read: file is not a database"):
+    with pytest.raises(StudyError, match=r"trials.db: cannot be used: file is not a database"):
         run_search(space, tmp_path / "whole")
 
 
@@ -171,9 +171,9 @@ def test_bad_spaces_are_one_line(space, tmp_path, old, new, line):
 def test_folders_that_cannot_take_a_search(space, tmp_path):
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "a.txt").write_text("mine")
-    with pytest.raises(StudyError, match="is not empty and holds no search"):
+    with pytest.raises(StudyError, match="exists and is not an empty folder"):
         run_search(space, tmp_path / "notes")
-    with pytest.raises(StudyError, match="exists and is not a folder"):
+    with pytest.raises(StudyError, match="exists and is not an empty folder"):
         run_search(space, tmp_path / "tiny.toml")
     with pytest.raises(StudyError, match=r"nowhere: neither a file of a search space nor a shipped one; known: dqn"):
         load_space("nowhere")

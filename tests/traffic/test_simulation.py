@@ -16,6 +16,7 @@ import pytest
 from click.testing import CliRunner
 from numpy.testing import assert_allclose, assert_array_equal
 
+from tests.planted import imported_from, plant
 from tests.traffic.networks import osm_extract
 from tests.traffic.test_workspace import wait_for
 from uavmec_jax.cli import main
@@ -192,6 +193,26 @@ def test_an_extract_without_roads_is_one_line(tmp_path):
     )
     assert done.exit_code == 2
     assert "park.osm: netconvert: " in done.stderr
+
+
+def test_planted_modules_do_not_run_in_sumo_and_its_helpers(folder, tmp_path, monkeypatch):
+    enter, leave, traces = Workspace.__enter__, Workspace.__exit__, []
+
+    def planted(self):
+        enter(self)
+        plant(self.folder)  # where SUMO runs
+        return self
+
+    def look(self, *error):
+        traces.append(imported_from(self.folder))
+        leave(self, *error)
+
+    monkeypatch.setattr(Workspace, "__enter__", planted)
+    monkeypatch.setattr(Workspace, "__exit__", look)
+    monkeypatch.chdir(plant(tmp_path / "here"))
+    assert build(folder).meta["seeds"] == 2
+    assert traces == [[]]
+    assert imported_from(tmp_path / "here") == []
 
 
 def test_sumos_last_error_is_reported(folder, monkeypatch):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.planted import imported_from, plant
 from uavmec_jax.errors import TrafficError
 from uavmec_jax.traffic.workspace import Workspace, last_error
 
@@ -51,6 +52,15 @@ def test_it_works_on_without_its_watchdog():
         assert workspace.run("p", python("print(1)"), limit_s=20) == "1\n"
         folder = workspace.folder
     assert not folder.exists()
+
+
+def test_planted_modules_do_not_run_in_the_watchdog(tmp_path, monkeypatch):
+    monkeypatch.chdir(plant(tmp_path))
+    with Workspace() as workspace:
+        assert workspace.run("p", [sys.executable, "-I", "-c", "print(1)"], limit_s=20) == "1\n"
+        process = workspace._watchdog
+    assert process.returncode == 0
+    assert imported_from(tmp_path) == []
 
 
 def test_nothing_is_started_after_a_stop():

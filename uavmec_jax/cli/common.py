@@ -1,5 +1,6 @@
 """Shared by the commands: errors in one line, settings from the command line, tables on the terminal."""
 
+import functools
 import json
 import sys
 import time
@@ -148,8 +149,15 @@ def print_tables(console: Any, tables: dict[str, Any], lines: list[str], directo
 
 
 def new_folder(name: str) -> Path:
-    """Return the default folder of a run, a search or a tour."""
-    return Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    """Create the default folder of a run, a search or a tour; the end of the command removes it if it is still empty."""
+    from uavmec_jax.files.output_folders import create_new_folder, remove_if_empty
+
+    runs = Path("runs")
+    created = [] if runs.exists() else [runs]
+    folder = create_new_folder(runs, f"{name}-{time.strftime('%Y%m%d-%H%M%S')}")
+    for path in (*created, folder):  # the last one is called first
+        click.get_current_context().call_on_close(functools.partial(remove_if_empty, path))
+    return folder
 
 
 def command_line() -> str:

@@ -33,9 +33,9 @@ def plan(scenario: ScenarioChoice, draws: int, width: int | None, out: Path | No
 
     host.use_all_cores()
     from uavmec_jax.cli.console import new_console
+    from uavmec_jax.files.output_folders import claimed
     from uavmec_jax.planning.plan import PLANNED_SLOTS, make_plan
     from uavmec_jax.reporting.plan import plan_data, plan_summary, plan_tables, save_plan
-    from uavmec_jax.runs.results_folder import check_directory
 
     named = scenario.load()
     if named.params.end == "horizon":
@@ -43,9 +43,9 @@ def plan(scenario: ScenarioChoice, draws: int, width: int | None, out: Path | No
     if "max_slots" not in scenario.settings:
         named = named.with_slot_limit(PLANNED_SLOTS)
     directory = out or new_folder("plan")
-    check_directory(directory)
-    result = make_plan(named.params, named.layout, named.draws(draws), width=width)
-    save_plan(result, named, directory, command_line())
+    with claimed(directory):
+        result = make_plan(named.params, named.layout, named.draws(draws), width=width)
+        save_plan(result, named, directory, command_line())
     if as_json:
         print_json(plan_data(result, named))
         return

@@ -40,7 +40,8 @@ def search(space: str, trials: int | None, out: Path | None, no_confirm: bool, r
     from uavmec_jax.reporting.compare import comparison
     from uavmec_jax.reporting.search import history_figure, importance_figure, search_json, search_tables
     from uavmec_jax.search.confirm import confirm
-    from uavmec_jax.search.search import BEST, run_search
+    from uavmec_jax.search.folder import BEST, search_folder
+    from uavmec_jax.search.search import continue_search
     from uavmec_jax.search.space import load_space
 
     loaded = load_space(space, {"trials": trials} if trials else None)
@@ -48,11 +49,14 @@ def search(space: str, trials: int | None, out: Path | None, no_confirm: bool, r
     console.print_heading(loaded.name, f"{loaded.trials} trials of {loaded.study}, {loaded.batch} at a time")
     try:
         # one connection for the search and its two runs
-        with console.status("compiling") as line, connected(ray):
-            result = run_search(
+        with (
+            search_folder(directory, loaded, command_line()),
+            console.status("compiling") as line,
+            connected(ray),
+        ):
+            result = continue_search(
                 loaded,
                 directory,
-                command=command_line(),
                 ray=ray,
                 on_progress=lambda progress: line.update(Text(_describe(progress))),
             )

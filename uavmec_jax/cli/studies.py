@@ -83,8 +83,8 @@ def run(
 
     host.use_all_cores()
     from uavmec_jax.cli.console import new_console
+    from uavmec_jax.files.output_folders import check_directory
     from uavmec_jax.reporting.progress import progress_bar
-    from uavmec_jax.runs.results_folder import check_directory
     from uavmec_jax.runs.run import run_study
     from uavmec_jax.studies.study import load_study
 

@@ -6,7 +6,7 @@ import secrets
 import socket
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import chdir, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,9 @@ _QUIET = {
 _ON_NETWORK = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 """Ray's variable that keeps a cluster on the loopback interface if it is 0, in spite of its name on Linux too; else Ray
 listens on the machine's outer address, whatever address it is given."""
+
+_TOKEN_FILE = "RAY_AUTH_TOKEN_PATH"
+"""Ray's variable that names a file with the token."""
 
 
 @dataclass(frozen=True)
@@ -151,13 +154,17 @@ def connected(options: RayOptions | None) -> Iterator[Cluster | None]:
 def _init(ray: Any, address: str) -> None:
     """Connect this process to a cluster.
 
+    Ray puts the folder in which a driver connects first on the path of its workers, on every node, so that a ``json.py``
+    beside a study would run there. So this process is in Python's own folder meanwhile.
+
     Raises:
         StudyError: nobody answers at the address.
     """
     if ":" in address and not _answers(address):
         raise StudyError(f"--ray {address}: cannot reach a Ray cluster at this address")
     try:
-        ray.init(address, log_to_driver=False, logging_level="error")
+        with chdir(sys.prefix):
+            ray.init(address, log_to_driver=False, logging_level="error")
     except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
         if "No node info found" in str(error):
             raise StudyError(
@@ -222,6 +229,8 @@ def prepare_environment(address: str) -> None:
     """
     for name, value in _QUIET.items():
         os.environ.setdefault(name, value)
+    if path := os.environ.get(_TOKEN_FILE):
+        os.environ[_TOKEN_FILE] = os.path.abspath(path)  # Ray reads it in another folder, see `_init`
     if address == LOCAL:
         wanted = {_ON_NETWORK: "0", "RAY_AUTH_MODE": os.environ.get("RAY_AUTH_MODE", "token")}
         if wanted["RAY_AUTH_MODE"] == "token" and not _has_token():
@@ -239,5 +248,5 @@ def prepare_environment(address: str) -> None:
 def _has_token() -> bool:
     if os.environ.get("RAY_AUTH_TOKEN"):
         return True
-    path = os.environ.get("RAY_AUTH_TOKEN_PATH")
+    path = os.environ.get(_TOKEN_FILE)
     return (Path(path) if path else Path.home() / ".ray" / "auth_token").is_file()

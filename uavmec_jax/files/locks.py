@@ -62,14 +62,22 @@ def owner_of(folder: Path) -> dict[str, Any] | None:
     return owner if owner and not is_known_dead(owner) else None
 
 
+def in_use(of: Path, owner: dict[str, Any], more: str = "") -> StudyError:
+    """Return the error that names who works in a folder."""
+    return StudyError(f"{of}: {describe_process(owner)} is working in it{more}")
+
+
 @contextmanager
-def lock_folder(folder: Path, of: Path, *, take_over: bool = False) -> Iterator[None]:
+def lock_folder(
+    folder: Path, of: Path, *, take_over: bool = False, if_dead: str = "if that process is dead, give --take-over"
+) -> Iterator[None]:
     """Hold the lock on a folder, which is created if it is missing.
 
     Args:
         folder: the folder.
         of: what the message names in place of the folder.
         take_over: whether to replace an owner on another machine, which may be dead.
+        if_dead: what the message says is to be done about such an owner.
 
     Raises:
         StudyError: another process holds it.
@@ -78,7 +86,7 @@ def lock_folder(folder: Path, of: Path, *, take_over: bool = False) -> Iterator[
     make_folder(folder)
     lock = _acquire(folder, of)
     try:
-        token = _become_owner(folder, of, take_over, locked=lock is not None)
+        token = _become_owner(folder, of, take_over, if_dead, locked=lock is not None)
         try:
             yield
         finally:
@@ -96,13 +104,13 @@ def _acquire(folder: Path, of: Path) -> FileLock | None:
     try:
         lock.acquire()
     except Timeout:
-        raise _in_use(of, read_json_or_empty(folder / OWNER)) from None
+        raise in_use(of, read_json_or_empty(folder / OWNER)) from None
     except NotImplementedError:
         return None
     return lock
 
 
-def _become_owner(folder: Path, of: Path, take_over: bool, *, locked: bool) -> str:
+def _become_owner(folder: Path, of: Path, take_over: bool, if_dead: str, *, locked: bool) -> str:
     """Create the owner's file, which holds the token that is returned."""
     path, token = folder / OWNER, secrets.token_hex(8)
     if path.exists():
@@ -110,12 +118,12 @@ def _become_owner(folder: Path, of: Path, take_over: bool, *, locked: bool) -> s
         here = not owner or owner.get("machine") == this_machine()
         free = take_over or is_known_dead(owner) or (locked and here)
         if not free:
-            raise _in_use(of, owner, "; if that process is dead, give --take-over")
+            raise in_use(of, owner, f"; {if_dead}")
         path.unlink(missing_ok=True)
     if not create_exclusively(path, json.dumps(this_process() | {"token": token}).encode()):
         owner = read_json_or_empty(path)
         if owner.get("token") != token:  # a store may answer so to a request that it was sent twice
-            raise _in_use(of, owner)
+            raise in_use(of, owner)
     return token
 
 
@@ -124,10 +132,6 @@ def _resign(path: Path, token: str) -> None:
     with suppress(OSError), store_errors():
         if read_json_or_empty(path).get("token") == token:
             path.unlink(missing_ok=True)
-
-
-def _in_use(of: Path, owner: dict[str, Any], more: str = "") -> StudyError:
-    return StudyError(f"{of}: {describe_process(owner)} is working in it{more}")
 
 
 def _born(pid: int) -> str | None:

@@ -5,42 +5,13 @@ from pathlib import Path
 from typing import Any
 
 from uavmec_jax.errors import StudyError
-from uavmec_jax.files.locations import names_in, reached, remove_folder
-from uavmec_jax.files.locks import describe_process, owner_of
+from uavmec_jax.files.locations import reached, remove_folder
 from uavmec_jax.files.writing import set_aside
-from uavmec_jax.runs.folder import RUN_PLAN, SHARDS, TOUR, RunFolder
+from uavmec_jax.runs.folder import RUN_PLAN, TOUR, RunFolder
 from uavmec_jax.studies.population import cell_axes
-from uavmec_jax.studies.results import RUN, STUDY, Results
+from uavmec_jax.studies.results import RUN, Results
 from uavmec_jax.studies.results_files import read_results
 from uavmec_jax.studies.shard_result import ShardResult
-
-
-def check_directory(directory: Path) -> None:
-    """Refuse a folder that cannot take a run or a tour.
-
-    Raises:
-        StudyError: it is not empty, another process works in it, it is a file, or its object store cannot be reached.
-    """
-    with reached(directory):
-        if (owner := owner_of(directory / SHARDS)) is not None:
-            raise StudyError(f"{directory}: {describe_process(owner)} is working in it")
-        check_empty(directory)
-
-
-def check_empty(directory: Path) -> None:
-    """Refuse a folder that holds anything but a lock.
-
-    Raises:
-        StudyError: it holds a run, a tour or other files, or is a file.
-    """
-    if any((directory / name).exists() for name in (RUN, STUDY, RUN_PLAN)):
-        raise StudyError(
-            f"{directory}: already holds a run; resume it with `uavmec resume`, or give another folder with --out"
-        )
-    if (directory / TOUR).exists():
-        raise StudyError(f"{directory}: already holds a tour of `uavmec plan`; give another folder with --out")
-    if directory.exists() and not (directory.is_dir() and set(names_in(directory)) <= {SHARDS}):
-        raise StudyError(f"{directory}: exists and is not an empty folder; give another one with --out")
 
 
 def assemble_results(folder: RunFolder, shards: Iterable[ShardResult], **more: Any) -> Results:

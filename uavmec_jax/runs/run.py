@@ -13,6 +13,7 @@ from uavmec_jax.cluster.options import RayOptions
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files.locations import is_local, reached, remove_folder, to_path
 from uavmec_jax.files.locks import lock_folder
+from uavmec_jax.files.output_folders import check_directory, check_empty
 from uavmec_jax.runs.folder import LOG, RUN_PLAN, SHARDS, RunFolder
 from uavmec_jax.runs.in_process import OnProgress, run_here
 from uavmec_jax.runs.log import OnEvent, RunLog, tensorboard_writer
@@ -20,8 +21,6 @@ from uavmec_jax.runs.on_ray import run_on_ray
 from uavmec_jax.runs.options import RunOptions
 from uavmec_jax.runs.results_folder import (
     assemble_results,
-    check_directory,
-    check_empty,
     load_results,
     partial_results,
     read_finished_shards,
@@ -91,7 +90,7 @@ def run_study(
     if options.tensorboard:
         tensorboard_writer()
     with nullcontext() if path is None else reached(path), connected(ray) as cluster:
-        machine = probe_node(cluster, lambda event, **facts: on_event(event, facts)) if cluster else None
+        machine = probe_node(cluster, on_event) if cluster else None
         plan = plan_run(study, shard_size=shard_size, machine=machine)
         on_plan(plan)
         label = label_of(study, plan, command)

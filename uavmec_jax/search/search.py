@@ -12,10 +12,8 @@ import pandas as pd
 
 from uavmec_jax.cluster.connection import connected
 from uavmec_jax.cluster.options import RayOptions
-from uavmec_jax.errors import StudyError
-from uavmec_jax.files.extras import optional
-from uavmec_jax.files.locations import local_path
 from uavmec_jax.files.writing import write_text
+from uavmec_jax.search.folder import BATCH, BEST, TRIALS, import_optuna, opened_trials, search_folder
 from uavmec_jax.search.halving import SuccessiveHalving, TrialOutcome
 from uavmec_jax.search.space import (
     Choices,
@@ -23,22 +21,16 @@ from uavmec_jax.search.space import (
     Space,
     baseline_settings,
     contains,
-    identity,
     static_combinations,
     static_settings,
     study_changes,
 )
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.studies.study import load_study, study_toml
-from uavmec_jax.training import host
 from uavmec_jax.training.machine import probe_node
 
 if TYPE_CHECKING:
     import optuna
-
-DATABASE, TRIALS, BEST, FACTS = "trials.db", "trials.csv", "best.toml", "search.json"
-
-_BATCH = "batch"
 
 
 @dataclass(frozen=True)
@@ -109,19 +101,29 @@ def run_search(
         on_progress: called while batches train; on Ray, whenever a shard gets to a rung.
 
     Raises:
-        StudyError: Optuna is not installed, the directory holds another search or something else, or a batch does not
-            fit in memory; on Ray, also if it is not installed or cannot be reached, a node has other code, or a shard failed.
+        StudyError: Optuna is not installed, the directory holds another search or something else, another process works in
+            it or has locked the database, or a batch does not fit in memory; on Ray, also if it is not installed or cannot
+            be reached, a node has other code, or a shard failed.
     """
-    optuna = _import_optuna()
-    path = local_path(directory, "the database of a search")
-    _check_directory(path, space)
-    path.mkdir(parents=True, exist_ok=True)
-    write_text(path / FACTS, json.dumps({"space": space.model_dump(mode="json"), "command": command} | host.describe()))
-    trials = _open_trials(optuna, path, space)
-    with connected(RayOptions.of(ray)) as cluster:
-        halving = SuccessiveHalving(space, cluster, probe_node(cluster) if cluster else None)
-        _run_batches(optuna, trials, halving, on_progress)
-    result = _search_result(optuna, trials, space)
+    with search_folder(directory, space, command) as path:
+        return continue_search(space, path, ray=ray, on_progress=on_progress)
+
+
+def continue_search(
+    space: Space,
+    path: Path,
+    *,
+    ray: RayOptions | str | bool | None = None,
+    on_progress: Callable[[SearchProgress], None] = lambda _: None,
+) -> SearchResult:
+    """Run a search in a folder that :func:`search_folder` holds; otherwise as :func:`run_search`."""
+    optuna = import_optuna()
+    with opened_trials(path, space) as trials:
+        _enqueue_baseline(trials, space)
+        with connected(RayOptions.of(ray)) as cluster:
+            halving = SuccessiveHalving(space, cluster, probe_node(cluster) if cluster else None)
+            _run_batches(optuna, trials, halving, on_progress)
+        result = _search_result(optuna, trials, space)
     write_text(path / TRIALS, result.trials.to_csv(index=False, float_format="%.6g"))
     write_text(path / BEST, study_toml(best_study(result)))
     return result
@@ -140,8 +142,10 @@ def _run_batches(
         if all(trial.state.is_finished() for trial in members):
             continue
 
-        def report(share: float, batch_trials: int, finished: int = batch * space.batch) -> None:
-            on_progress(SearchProgress(finished, space.trials, share, batch_trials, _best_value(trials)))
+        finished, best = batch * space.batch, _best_value(trials)
+
+        def report(share: float, batch_trials: int, finished: int = finished, best: float = best) -> None:
+            on_progress(SearchProgress(finished, space.trials, share, batch_trials, best))
 
         halving.on_progress = report
         outcomes = halving.run([_settings(space, trial.params) for trial in members])
@@ -156,42 +160,12 @@ def best_study(result: SearchResult) -> Study:
     return study.model_copy(update={"name": f"{result.space.name}-best"})
 
 
-def _import_optuna() -> Any:
-    optuna = optional("optuna", "search", "search")
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-    return optuna
-
-
-def _check_directory(path: Path, space: Space) -> None:
-    """Raise a StudyError unless the folder is new, empty, or holds this very search."""
-    if path.exists() and not path.is_dir():
-        raise StudyError(f"{path}: exists and is not a folder; give another one with --out")
-    if not path.exists() or not any(path.iterdir()):
-        return
-    try:
-        before = Space.model_validate(json.loads((path / FACTS).read_text(encoding="utf-8"))["space"], strict=True)
-    except (OSError, ValueError, KeyError, TypeError):
-        raise StudyError(f"{path}: is not empty and holds no search; give another folder with --out") from None
-    if identity(before) != identity(space):
-        raise StudyError(f"{path}: holds another search; give another folder with --out")
-
-
-def _open_trials(optuna: Any, path: Path, space: Space) -> "optuna.Study":
-    """Open the database; the first trial of a new one has the study's own settings, as far as the space contains them."""
-    from sqlalchemy import URL
-    from sqlalchemy.exc import DatabaseError
-
-    url = URL.create("sqlite", database=str(path / DATABASE)).render_as_string()
-    try:
-        storage = optuna.storages.RDBStorage(url)
-        trials = optuna.create_study(storage=storage, study_name=space.name, direction="maximize", load_if_exists=True)
-    except DatabaseError as error:
-        raise StudyError(f"{path / DATABASE}: cannot be read: {error.orig!s}") from None
+def _enqueue_baseline(trials: "optuna.Study", space: Space) -> None:
+    """Let the first trial of a new search have the study's own settings, as far as the space contains them."""
     if not trials.get_trials(deepcopy=False):
         baseline = baseline_settings(space)
         inside = {key: value for key, value in baseline.items() if contains(space.space[key], value)}
         trials.enqueue_trial({key: _to_optuna(value) for key, value in inside.items()})
-    return trials
 
 
 def _propose_batch(optuna: Any, trials: "optuna.Study", space: Space, batch: int) -> list[Any]:
@@ -203,7 +177,7 @@ def _propose_batch(optuna: Any, trials: "optuna.Study", space: Space, batch: int
     """
     names, combinations, baseline = static_settings(space), static_combinations(space), baseline_settings(space)
     size = min(space.batch, space.trials - batch * space.batch)
-    members = [trial for trial in trials.get_trials(deepcopy=False) if trial.user_attrs.get(_BATCH) == batch]
+    members = [trial for trial in trials.get_trials(deepcopy=False) if trial.user_attrs.get(BATCH) == batch]
     while len(members) < size:
         number = batch * space.batch + len(members)
         sampler = optuna.samplers.TPESampler(
@@ -222,7 +196,7 @@ def _propose_batch(optuna: Any, trials: "optuna.Study", space: Space, batch: int
         trial = trials.ask()
         for key, values in space.space.items():
             _suggest(trial, key, values, baseline[key])
-        trial.set_user_attr(_BATCH, batch)
+        trial.set_user_attr(BATCH, batch)
         members.append(trials.get_trials(deepcopy=False)[trial.number])
     return sorted(members, key=lambda trial: trial.number)
 
@@ -256,7 +230,8 @@ def _record(optuna: Any, trials: "optuna.Study", trial: Any, outcome: TrialOutco
     """Store the outcome of a trial."""
     live = optuna.trial.Trial(trials, trial._trial_id)
     for step, value in outcome.rungs.items():
-        live.report(value, step)
+        if step not in trial.intermediate_values:  # stored before a search was stopped
+            live.report(value, step)
     if outcome.value is None:
         trials.tell(trial.number, state=optuna.trial.TrialState.PRUNED)
     else:
@@ -273,7 +248,7 @@ def _search_result(optuna: Any, trials: "optuna.Study", space: Space) -> SearchR
     rows = []
     for trial in trials.get_trials(deepcopy=False)[: space.trials]:
         if trial.state.is_finished():
-            row = {"number": trial.number, "batch": trial.user_attrs[_BATCH], "state": trial.state.name.lower()}
+            row = {"number": trial.number, "batch": trial.user_attrs[BATCH], "state": trial.state.name.lower()}
             row |= {"value": trial.value, "steps": max(trial.intermediate_values, default=0)}
             rows.append(row | {key: _to_optuna(value) for key, value in _settings(space, trial.params).items()})
     with warnings.catch_warnings():

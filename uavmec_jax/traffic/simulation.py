@@ -125,7 +125,8 @@ def _run_job(job: Path, limit_s: float, workspace: Workspace) -> Path:
         **sumo.environment(),
         "PYTHONPATH": os.pathsep.join([packages, os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep),
     }
-    workspace.run("SUMO", [sys.executable, "-m", "uavmec_jax.traffic.worker", job], limit_s=limit_s, env=env)
+    worker = [sys.executable, "-P", "-m", "uavmec_jax.traffic.worker"]  # -P: no module of the folder it runs in
+    workspace.run("SUMO", [*worker, job], limit_s=limit_s, env=env)
     return job.with_suffix(".npz")
 
 

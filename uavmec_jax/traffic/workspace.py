@@ -43,7 +43,7 @@ class Workspace:
         self._running: set[subprocess.Popen] = set()
         self._stopped = False
         self._watchdog = subprocess.Popen(
-            [sys.executable, "-S", "-E", "-c", _WATCHDOG, str(self.folder)],
+            [sys.executable, "-I", "-S", "-c", _WATCHDOG, str(self.folder)],  # -I: no module of the working folder
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,  # a reader of our output must not wait for the watchdog to end
             stderr=subprocess.DEVNULL,

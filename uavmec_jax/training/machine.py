@@ -83,18 +83,25 @@ class WorkerOptions:
                 raise StudyError(f"node {node_name()}: {error}") from error
 
 
-def probe_node(cluster: Cluster, on_event: Callable[..., None] = lambda event, **facts: None) -> Machine:
+def probe_node(
+    cluster: Cluster, on_event: Callable[[str, dict[str, Any]], None] = lambda event, facts: None
+) -> Machine:
     """Return what a shard has on a node of the cluster, which may be waited for.
 
     Args:
         cluster: the cluster.
-        on_event: called with ``("waiting", error=...)`` if no node can take a shard.
+        on_event: called with ``(event, facts)`` if no node can take a shard, or an attempt is lost or retried; the facts are
+            ``error`` and perhaps ``shard``, which is then ``probe``.
 
     Raises:
         StudyError: the node has other code than the driver, or not the GPUs.
     """
-    task = Task("probe", _describe_node, lambda: (WorkerOptions.of(cluster),))
-    ((_, machine),) = TaskRun(cluster, on_event=on_event).results([task])
+
+    def report(event: str, *, error: str, task: str | None = None) -> None:
+        on_event(event, {"error": error} if task is None else {"error": error, "shard": task})
+
+    probe = Task("probe", _describe_node, lambda: (WorkerOptions.of(cluster),))
+    ((_, machine),) = TaskRun(cluster, on_event=report).results([probe])
     if isinstance(machine, TaskError):
         raise StudyError(machine.error.removeprefix("StudyError: "))
     return Machine(**machine)
