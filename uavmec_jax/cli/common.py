@@ -55,19 +55,22 @@ def print_json(data: Any) -> None:
     click.echo(json.dumps(data, indent=1))
 
 
-def print_results(results: Any, directory: Path, console: Any, as_json: bool) -> None:
-    """Print the tables of a run; as JSON, its label and its cells."""
+def print_results(results: Any, directory: Path, console: Any, as_json: bool, status: Any = None) -> None:
+    """Print the tables of a run, and its status if that is given; as JSON, its label, its cells and its status."""
+    from uavmec_jax.reporting.status import status_lines
     from uavmec_jax.reporting.summary import summary
     from uavmec_jax.reporting.tables import tables
     from uavmec_jax.studies.first_failures import place_frames
 
     if as_json:
         data = {"directory": str(directory), "run": results.run}
+        data |= {} if status is None else {"status": status.as_json()}
         for name, table in {"cells": results.cells(), **place_frames(results)}.items():
             data[name] = json.loads(table.to_json(orient="records"))
         print_json(data)
         return
-    print_tables(console, tables(results), summary(results), directory)
+    lines = [] if status is None else [f"{results.study.name}, a run that is not complete", *status_lines(status)]
+    print_tables(console, tables(results), [*summary(results), *lines], directory)
 
 
 def print_tables(console: Any, tables: dict[str, Any], lines: list[str], directory: Path | None = None) -> None:
@@ -76,9 +79,9 @@ def print_tables(console: Any, tables: dict[str, Any], lines: list[str], directo
         console.print(f"[bold]{title}[/bold]")
         console.print(table)
     for line in lines:
-        console.print(line, highlight=False)
+        console.print(line, highlight=False, markup=False)
     if directory is not None:
-        console.print(f"Files: {directory}", highlight=False, soft_wrap=True)
+        console.print(f"Files: {directory}", highlight=False, markup=False, soft_wrap=True)
 
 
 def new_folder(name: str) -> Path:

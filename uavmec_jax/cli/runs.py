@@ -15,9 +15,11 @@ from uavmec_jax.cli.common import (
 )
 from uavmec_jax.cli.options import directory_argument, json_option, ray_options
 from uavmec_jax.cluster.options import RayOptions
+from uavmec_jax.errors import one_line
 from uavmec_jax.runs.options import RunOptions
 
 _EVENTS = {
+    "ignored": "ignored, since no run wrote them: {names}",
     "damaged": "shard {shard}: {error}; the file is renamed and not used",
     "restored": "shard {shard} resumes from {file}, step {steps:,}",
     "failed": "shard {shard} failed: {error}",
@@ -33,7 +35,8 @@ def event_printer(console: Any) -> Callable[[str, dict[str, Any]], None]:
 
     def print_event(event: str, facts: dict[str, Any]) -> None:
         if event in _EVENTS:
-            console.print(_EVENTS[event].format(**facts), highlight=False, soft_wrap=True)
+            line = one_line(_EVENTS[event].format(**facts))
+            console.print(line, markup=False, highlight=False, soft_wrap=True)
 
     return print_event
 
@@ -108,7 +111,7 @@ def status(directory: Path, as_json: bool) -> None:
         print_json(current.as_json())
         return
     for line in status_lines(current):
-        Console().print(line, highlight=False, soft_wrap=True)
+        Console().print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def print_simulation(
