@@ -51,7 +51,7 @@ STRANGERS = (
     "00001/Thumbs.db",
     "00001/.~lock.result-01-abcdef.npz#",
     "00001/result-01-abcdef.npz.icloud",
-    "00001/[/bold] markup\n.txt",
+    "00001/[bold] markup\n.txt",
     ".DS_Store",
     "abc/result-01-abcdef.npz",
     "00001 (1)/result-01-abcdef.npz",
@@ -99,7 +99,7 @@ def folder(path):
 
 
 def other_shard(path):
-    shutil.copy(result_of(path.parents[1]), path)
+    shutil.copy(result_of(path.parents[2]), path)
 
 
 PLANTED = (pipe, link_to_a_device, link_to_nowhere, folder, other_shard)
@@ -154,9 +154,8 @@ def test_copies_and_pipes_beside_the_checkpoints_do_no_harm(tmp_path):
     (shard / "checkpoint-999999-01-dddddd.npz").mkdir()
     shutil.copy(newest, shard / f"checkpoint-999999-{newest.stem[-9:]}.npz")  # renamed: its contents are right
     resume_run(tmp_path / "run")
-    assert [event["file"] for event in events(tmp_path / "run", "damaged")] == [
-        f"checkpoint-999999-01-{letter * 6}.npz" for letter in "cba"
-    ][-len(events(tmp_path / "run", "damaged")) :]
+    planted = {f"checkpoint-999999-01-{letter * 6}.npz" for letter in "abc"}
+    assert {event["file"] for event in events(tmp_path / "run", "damaged")} <= planted
     assert len(events(tmp_path / "run", "restored")) == 1
     assert bits(tmp_path / "run") == bits(tmp_path / "whole")
 
