@@ -1,5 +1,6 @@
 """Runs on Ray and the faults that can strike them, for the campaign in `faults.py`."""
 
+import ctypes
 import json
 import os
 import random
@@ -9,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -20,6 +22,8 @@ NODES, CPUS = 3, 2
 TIME_LIMIT_S = 60
 """Longer than three nodes take to start and to train on two cores; an attempt that hangs is ended after it."""
 PATIENCE_S = 600.0
+PTRACE_SEIZE, PTRACE_INTERRUPT, WAIT_FOR_ALL = 0x4206, 0x4207, 0x40000000
+"""Numbers of Linux, which Python does not name."""
 
 
 def new_nodes() -> SimulatedNodes:
@@ -163,18 +167,36 @@ def fill_disk(run: Run) -> bool:
 
 
 def hang(run: Run) -> bool:
-    """Let an attempt read a checkpoint that never comes: a pipe into which nobody writes."""
+    """Stop the main thread of an attempt, as a file server that does not answer would: its process is alive, and silent."""
     stop(run)
-    if not (found := run.checkpoints()):
-        run.start()
-        return False
-    lost, pipe = _log(run).count('"lost"'), found[0].parent / "checkpoint-999999-00-000000.npz"
-    os.mkfifo(pipe)
+    lost = _log(run).count('"lost"')
     run.limit = ["--time-limit", str(TIME_LIMIT_S)]
     run.start()
-    run.wait(lambda: _log(run).count('"lost"') > lost)
-    pipe.unlink(missing_ok=True)
+    if not run.wait(run.running):
+        return False
+    pid = run.chance.choice(run.running())["pid"]
+    if not _stop_main_thread(pid):
+        return False
+
+    def is_lost() -> bool:
+        _collect(pid)
+        return _log(run).count('"lost"') > lost
+
+    run.wait(is_lost)
     return True
+
+
+def _stop_main_thread(pid: int) -> bool:
+    """Stop one thread of a process, which no signal can; return whether the process was still there."""
+    ptrace = ctypes.CDLL(None, use_errno=True).ptrace
+    ptrace.argtypes, ptrace.restype = (ctypes.c_long, ctypes.c_long, ctypes.c_void_p, ctypes.c_void_p), ctypes.c_long
+    return all(ptrace(request, pid, None, None) == 0 for request in (PTRACE_SEIZE, PTRACE_INTERRUPT))
+
+
+def _collect(pid: int) -> None:
+    """Let a process whose thread was stopped disappear when it has ended: its parent learns of it only then."""
+    with suppress(ChildProcessError):
+        os.waitpid(pid, WAIT_FOR_ALL | os.WNOHANG)
 
 
 def kill_head(run: Run) -> bool:

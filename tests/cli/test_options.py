@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -224,16 +225,13 @@ def test_the_table_of_a_set_is_one_of_the_place(refused):
 def test_a_value_that_is_too_deep_or_too_long_is_refused(option, value):
     with pytest.raises(InputError) as caught:
         assignment(f"steps={value}", option)
-    assert caught.value.message.endswith(
-        "cannot be read; give tables of at most 16 levels and numbers of at most 4,300 digits"
-    )
+    assert re.match(rf"{option} steps: the value: (is nested too deep|.*more than 40 digits$)", caught.value.message)
 
 
 @pytest.mark.parametrize("text", ["x" * 1_000_000 + "=1", "steps=" + "x" * 1_000_000, ".".join("a" * 20_000) + "=1"])
 def test_a_huge_setting_is_refused(refused, text):
-    assert "is too long; a name has at most 200 characters, a value at most 100,000" in refused(
-        "run", "table5", "--set", text
-    )
+    line = refused("run", "table5", "--set", text)
+    assert "is too long; a name has at most 200 characters" in line or "characters; give at most 100000" in line
 
 
 def test_a_setting_that_is_not_utf8_is_refused(refused):

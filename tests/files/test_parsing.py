@@ -86,10 +86,12 @@ def test_json_that_is_no_object_is_refused(tmp_path, text, kind):
         read_json_object(path, StudyError)
 
 
-def test_a_value_is_one_value():
+def test_a_value_is_one_value_or_text():
     assert parse_value("[1, 2]") == [1, 2]
-    for text in ("1\nother = 2", "", "1 2", nested(20_000), "9" * 5000):
-        with pytest.raises(UserError):
+    for text in ("1\nother = 2", "", "1 2", "dqn"):
+        assert parse_value(text) == text
+    for text in (nested(20_000), "9" * 5000, ".".join("a" * 50_000), "x" * 200_000, "[" + "1," * 60_000 + "]"):
+        with pytest.raises(UserError, match=r"^the value"):
             parse_value(text)
 
 

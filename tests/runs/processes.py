@@ -31,6 +31,21 @@ baselines = ["oldest-first"]
 """
 
 
+UNTRAINED = """
+name = "untrained"
+algorithm = "none"
+[axes]
+powered = [12, 4]
+connected = [8]
+seeds = 2
+[evaluation]
+draws = 2
+planners = []
+baselines = ["oldest-first"]
+"""
+"""A study of which a run takes a second."""
+
+
 def plan_in(directory, study, shard_size=None) -> Path:
     """Plan a run in a folder, and run nothing."""
     directory.mkdir(parents=True, exist_ok=True)
@@ -79,8 +94,10 @@ def environment() -> dict[str, str]:
 
 
 def bits(directory: Path) -> dict[str, bytes]:
-    """The final files of a run."""
-    return {name: (directory / name).read_bytes() for name in FINAL}
+    """The final files of a run; those of training only where something is trained."""
+    trained = (directory / "weights.npz").exists()
+    names = FINAL if trained else ("agents.csv", "evaluation.npz", "study.toml")
+    return {name: (directory / name).read_bytes() for name in names}
 
 
 def events(directory: Path, kind: str) -> list[dict]:

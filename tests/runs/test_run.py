@@ -262,7 +262,7 @@ def damage(directory, tmp_path, name, content):
 @pytest.mark.parametrize("name", ["run.json", "curves.npz", "evaluation.npz", "study.toml"])
 def test_damaged_file_is_named(finished, tmp_path, name):
     copy = damage(finished[1], tmp_path, name, lambda data: data[: len(data) // 2])
-    with pytest.raises(StudyError, match=r"cannot be read|not TOML|is missing|study.toml: params"):
+    with pytest.raises(StudyError, match=r"cannot be read|not TOML|not JSON|is missing|study.toml: params"):
         load_results(copy)
 
 

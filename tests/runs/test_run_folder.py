@@ -127,7 +127,7 @@ def test_a_damaged_result_is_reported_and_the_shard_runs_again(whole, stopped, t
 @pytest.mark.parametrize(
     ("name", "line"),
     [
-        ("run_plan.json", r"run_plan\.json: (cannot be read|was altered)"),
+        ("run_plan.json", r"run_plan\.json: (not JSON|was altered)"),
         ("study.toml", r"study\.toml: was altered or damaged"),
     ],
 )
@@ -178,7 +178,7 @@ def test_a_flipped_bit_in_the_results_is_found(whole, tmp_path, name):
     flip(directory / name, 0.4)
     if name == "run.json":
         (directory / name).write_text((directory / name).read_text(errors="replace").replace('"complete"', '"comp', 1))
-    with pytest.raises(StudyError, match=r"cannot be read"):
+    with pytest.raises(StudyError, match=r"cannot be read|is missing|not JSON"):
         load_results(directory)
 
 

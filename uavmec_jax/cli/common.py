@@ -4,19 +4,19 @@ import functools
 import json
 import sys
 import time
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
 import click
 
-from uavmec_jax.errors import one_line
+from uavmec_jax.errors import UserError, one_line
+from uavmec_jax.files.parsing import parse_value
 
 _EXAMPLES = {"--set": "--set dqn.gamma=0.99", "--resource": "--resource bigmem=1"}
 
-_MAX_NAME, _MAX_VALUE, _MAX_DEPTH = 200, 100_000, 16
-"""Characters of a setting's name and of its value, and the levels of its tables and lists."""
+_MAX_NAME = 200
+"""Characters of a setting's name."""
 
 
 class InputError(click.ClickException):
@@ -58,39 +58,12 @@ def assignment(text: str, option: str = "--set") -> tuple[str, Any]:
         raise InputError(f"{option} {text}: give NAME=VALUE, e.g. {_EXAMPLES.get(option, 'algorithm=dqn')}")
     if not is_utf8(text):
         raise InputError(f"{option} {text}: holds bytes that are not UTF-8; give it in UTF-8")
-    if len(name) > _MAX_NAME or len(value) > _MAX_VALUE:
-        raise InputError(
-            f"{option} {text}: is too long; a name has at most {_MAX_NAME} characters, a value at most {_MAX_VALUE:,}"
-        )
+    if len(name) > _MAX_NAME:
+        raise InputError(f"{option} {text}: is too long; a name has at most {_MAX_NAME} characters")
     try:
-        return name.strip(), _parsed(value)
-    except (RecursionError, ValueError):
-        raise InputError(
-            f"{option} {text}: cannot be read; give tables of at most {_MAX_DEPTH} levels and numbers of at most 4,300 digits"
-        ) from None
-
-
-def _parsed(text: str) -> Any:
-    """Parse a value of TOML; what is none is a string.
-
-    Raises:
-        RecursionError, ValueError: the value is too deep, or a number too long.
-    """
-    try:
-        data = tomllib.loads(f"value = {text}")
-    except tomllib.TOMLDecodeError:
-        return text.strip()
-    level = [data]
-    for _ in range(_MAX_DEPTH + 1):
-        level = [
-            inner
-            for one in level
-            if isinstance(one, dict | list)
-            for inner in (one.values() if isinstance(one, dict) else one)
-        ]
-    if level:
-        raise RecursionError
-    return data["value"] if len(data) == 1 else text.strip()
+        return name.strip(), parse_value(value)
+    except UserError as error:
+        raise InputError(f"{option} {name.strip()}: {error}") from None
 
 
 def assignments(texts: Sequence[str], option: str = "--set") -> dict[str, Any]:
@@ -122,19 +95,22 @@ def print_json(data: Any) -> None:
     print_line(json.dumps(data, indent=1))
 
 
-def print_results(results: Any, directory: Path, console: Any, as_json: bool) -> None:
-    """Print the tables of a run; as JSON, its label and its cells."""
+def print_results(results: Any, directory: Path, console: Any, as_json: bool, status: Any = None) -> None:
+    """Print the tables of a run, and its status if that is given; as JSON, its label, its cells and its status."""
+    from uavmec_jax.reporting.status import status_lines
     from uavmec_jax.reporting.summary import summary
     from uavmec_jax.reporting.tables import tables
     from uavmec_jax.studies.first_failures import place_frames
 
     if as_json:
         data = {"directory": str(directory), "run": results.run}
+        data |= {} if status is None else {"status": status.as_json()}
         for name, table in {"cells": results.cells(), **place_frames(results)}.items():
             data[name] = json.loads(table.to_json(orient="records"))
         print_json(data)
         return
-    print_tables(console, tables(results), summary(results), directory)
+    lines = [] if status is None else [f"{results.study.name}, a run that is not complete", *status_lines(status)]
+    print_tables(console, tables(results), [*summary(results), *lines], directory)
 
 
 def print_tables(console: Any, tables: dict[str, Any], lines: list[str], directory: Path | None = None) -> None:
@@ -143,9 +119,9 @@ def print_tables(console: Any, tables: dict[str, Any], lines: list[str], directo
         console.print(title, style="bold")
         console.print(table)
     for line in lines:
-        console.print(line, highlight=False)
+        console.print(line, highlight=False, markup=False)
     if directory is not None:
-        console.print(f"Files: {directory}", highlight=False, soft_wrap=True)
+        console.print(f"Files: {directory}", highlight=False, markup=False, soft_wrap=True)
 
 
 def new_folder(name: str) -> Path:

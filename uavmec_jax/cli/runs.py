@@ -14,6 +14,7 @@ from uavmec_jax.errors import one_line
 from uavmec_jax.runs.options import RunOptions
 
 _EVENTS = {
+    "ignored": "ignored, since no run wrote them: {names}",
     "damaged": "shard {shard}: {error}; the file is renamed and not used",
     "restored": "shard {shard} resumes from {file}, step {steps:,}",
     "failed": "shard {shard} failed: {error}",

@@ -27,6 +27,7 @@ from uavmec_jax.cli.options import (
 from uavmec_jax.cli.runs import event_printer, print_simulation, report_results
 from uavmec_jax.cli.types import FiniteRange, FolderOfRun, NameOrPath, WholeNumber, refuse_given
 from uavmec_jax.errors import printable
+from uavmec_jax.runs.file_names import RUN_PLAN
 from uavmec_jax.runs.options import RunOptions
 
 QUICK_STEPS, QUICK_SEEDS, QUICK_VALIDATE_EVERY = 50_000, 3, 5_000
@@ -139,12 +140,15 @@ def _overrides(quick: bool, seeds: int | None, steps: int | None, settings: tupl
 @directory_argument
 @json_option
 def show(directory: Path, as_json: bool) -> None:
-    """Print the tables of the run in DIRECTORY."""
+    """Print the tables of the run in DIRECTORY; of one that is not complete, as far as it is, and its status."""
     from uavmec_jax.cli.console import new_console
     from uavmec_jax.runs.results_folder import load_results
+    from uavmec_jax.runs.status import run_status
 
     results = load_results(directory)
-    print_results(results, directory, new_console(stderr=as_json), as_json)
+    there = results.run["complete"] or not (directory / RUN_PLAN).exists()
+    console = new_console(stderr=as_json)
+    print_results(results, directory, console, as_json, None if there else run_status(directory))
 
 
 @click.command()

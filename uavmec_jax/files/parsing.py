@@ -22,10 +22,15 @@ MAX_DIGITS = 40
 MAX_TOML_CHARACTERS = 2**20
 """Longest TOML: a scenario of the most devices takes a tenth of it."""
 
+MAX_VALUE_CHARACTERS = 100_000
+"""Longest value of ``--set``."""
+
 MAX_ROWS = 100_000
 MAX_COLUMNS = 1000
 MAX_CELL = 10_000
 """Longest cell of a CSV, in characters."""
+
+_TOO_DEEP = f"{{}}: is nested too deep; tables and arrays may be nested {MAX_DEPTH} times"
 
 _SEPARATORS = (",", ";", "\t")
 
@@ -44,7 +49,7 @@ def parse_toml(text: str, source: object, error: type[UserError]) -> dict[str, A
     if len(text) > MAX_TOML_CHARACTERS:
         raise error(f"{source}: holds {len(text)} characters; TOML here has at most {MAX_TOML_CHARACTERS}")
     if _DEEP_KEY.search(text):
-        raise error(f"{source}: is nested too deep; tables and arrays may be nested {MAX_DEPTH} times")
+        raise error(_TOO_DEEP.format(source))
     return _parsed(lambda: tomllib.loads(text), "TOML", source, error)
 
 
@@ -80,15 +85,24 @@ _KINDS = {list: "a list", str: "text", bool: "a truth value", int: "a number", f
 
 
 def parse_value(text: str) -> Any:
-    """Parse a value as TOML writes it, such as ``0.5``, ``true``, ``"a"`` or ``[1, 2]``.
+    """Parse a value as TOML writes it, such as ``0.5``, ``true``, ``"a"`` or ``[1, 2]``; what is none is a string.
 
     Raises:
-        UserError: the text is not one value, or exceeds a limit.
+        UserError: the value exceeds a limit.
     """
-    data = parse_toml(f"value = {text}", "the value", UserError)
-    if set(data) != {"value"}:
-        raise UserError("the value is more than one value")
-    return data["value"]
+
+    def value() -> Any:
+        try:
+            data = tomllib.loads(f"value = {text}")
+        except tomllib.TOMLDecodeError:
+            return text.strip()
+        return data["value"] if len(data) == 1 else text.strip()
+
+    if len(text) > MAX_VALUE_CHARACTERS:
+        raise UserError(f"the value holds {len(text)} characters; give at most {MAX_VALUE_CHARACTERS}")
+    if _DEEP_KEY.search(text):
+        raise UserError(_TOO_DEEP.format("the value"))
+    return _parsed(value, "TOML", "the value", UserError)
 
 
 def parse_csv(text: str, source: object, error: type[UserError]) -> tuple[list[str], list[dict[str, str]]]:
@@ -151,7 +165,7 @@ def _parsed(parse: Callable[[], Any], form: str, source: object, error: type[Use
     except ValueError as problem:  # TOMLDecodeError and JSONDecodeError among them
         raise error(f"{source}: not {form}: {_in_words(problem)}") from None
     if deep:
-        raise error(f"{source}: is nested too deep; tables and arrays may be nested {MAX_DEPTH} times")
+        raise error(_TOO_DEEP.format(source))
     _check_whole_numbers(data, source, error)
     return data
 

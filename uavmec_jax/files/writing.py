@@ -12,7 +12,8 @@ from typing import IO, Any
 
 import numpy as np
 
-from uavmec_jax.files.locations import StoreError, file_system, is_local, path_in_store, store_errors
+from uavmec_jax.errors import UserError
+from uavmec_jax.files.locations import StoreError, file_system, is_local, path_in_store, reason_of, store_errors
 
 
 def write_text(path: Path, text: str) -> None:
@@ -25,6 +26,32 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], *, compressed: bo
     named: dict[str, Any] = dict(arrays)
     save = np.savez_compressed if compressed else np.savez
     _write(path, lambda file: save(file, **named))
+
+
+_CANNOT_WRITE = {
+    *(errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO),
+    *(errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOENT),
+}
+"""Numbers of the errors of a file system that refuses to be written to: read-only, not ours, full, damaged, in the way."""
+
+
+@contextmanager
+def writing_to(folder: Path, error: type[UserError]) -> Iterator[None]:
+    """Turn what a file system answers that cannot be written to into one line.
+
+    Raises:
+        UserError: something in the folder could not be written; of the type ``error``.
+    """
+    try:
+        yield
+    except OSError as problem:
+        if problem.errno not in _CANNOT_WRITE:  # such as a broken connection
+            raise
+        inside = str(problem.filename or folder)
+        where = (
+            inside if inside.startswith(str(folder)) and problem.errno not in (errno.EROFS, errno.ENOSPC) else folder
+        )
+        raise error(f"{where}: cannot be written to: {reason_of(problem)}") from problem
 
 
 def create_exclusively(path: Path, content: bytes) -> bool:
@@ -71,6 +98,10 @@ def atomic(path: Path) -> Iterator[Path]:
             yield partial
             _flush_to_disk(partial)
             partial.replace(path)
+        except OSError as problem:
+            if problem.filename in (None, str(partial)):  # a full disk names no file
+                problem.filename = str(path)
+            raise
         finally:
             partial.unlink(missing_ok=True)
         _flush_to_disk(path.parent)

@@ -24,7 +24,7 @@ from uavmec_jax.reporting.service import (
 )
 from uavmec_jax.reporting.tour_figure import tour_figure
 from uavmec_jax.reporting.tours import slot_rows, tour_table
-from uavmec_jax.runs.folder import TOUR
+from uavmec_jax.runs.file_names import TOUR
 from uavmec_jax.scenarios.named_scenario import NamedScenario
 from uavmec_jax.scenarios.scenario_files import scenario_text
 from uavmec_jax.training import host

@@ -11,14 +11,27 @@ from uavmec_jax.reporting.tables import by_fleet, display_name, gap_percent, ste
 from uavmec_jax.studies.measures import MOST_CENSORED, mostly_censored
 from uavmec_jax.studies.population import cell_axes
 from uavmec_jax.studies.results import Results
+from uavmec_jax.studies.results_files import LOST
 
 
 def summary(results: Results) -> list[str]:
     """Return the lines below the tables: overall means and gaps, of each fleet by itself, and what the run cost."""
     lines = []
-    for start, fleet in by_fleet(results).items():
+    for start, fleet in by_fleet(results).items() if len(results.agents) else ():
         lines += [start + line for line in (*_lifetime_lines(fleet), *_ladder_lines(fleet))]
-    return lines + _cost_lines(results)
+    return lines + _cost_lines(results) + _missing_lines(results)
+
+
+def _missing_lines(results: Results) -> list[str]:
+    """Return what is not there: agents that are not finished, and facts that are lost."""
+    run, lines = results.run, []
+    if not run["complete"]:
+        lines.append(f"{len(results.agents):,} of {run['agents']:,} agents are finished.")
+    if LOST in run:
+        lines.append(
+            f"Not known, since {run[LOST]} is lost: what the run cost, and whether its files are as it wrote them."
+        )
+    return lines
 
 
 def _lifetime_lines(results: Results) -> list[str]:

@@ -47,7 +47,12 @@ def _fleet_title(study: Study) -> str:
 
 
 def tables(results: Results) -> dict[str, Table]:
-    """Return the tables of a run by title: like Tables 5 to 7 where the study is like theirs, else a list of cells."""
+    """Return the tables of a run by title: like Tables 5 to 7 where the study is like theirs, else a list of cells.
+
+    There are none before the first shard is finished.
+    """
+    if not len(results.agents):
+        return {}
     cells = results.cells()
     if has_places(results):
         return table7_tables(results)

@@ -15,7 +15,8 @@ from uavmec_jax.files.locations import make_folder, store_errors
 from uavmec_jax.files.locks import this_process
 from uavmec_jax.files.writing import write_text
 from uavmec_jax.runs.checkpoints import Checkpoints
-from uavmec_jax.runs.folder import PROGRESS, RESULT, RunFolder
+from uavmec_jax.runs.file_names import PROGRESS, RESULT
+from uavmec_jax.runs.folder import RunFolder
 from uavmec_jax.runs.log import RunLog
 from uavmec_jax.runs.run_plan import Shard
 from uavmec_jax.runs.shard_runner import ShardRunner

@@ -4,13 +4,16 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from uavmec_jax.errors import StudyError
+from pydantic import ConfigDict, Field
+
+from uavmec_jax.errors import StudyError, UserError
 from uavmec_jax.files.archives import open_checked, write_checked
-from uavmec_jax.files.locations import files_matching
+from uavmec_jax.files.locations import is_local, names_in
+from uavmec_jax.files.validation import StrictModel, validated
 from uavmec_jax.files.writing import set_aside
-from uavmec_jax.runs.folder import CHECKPOINT
+from uavmec_jax.runs.file_names import CHECKPOINT, is_damaged, is_named
 from uavmec_jax.runs.options import CheckpointKind
 from uavmec_jax.scenarios.policy_files import PolicyCollection, write_policies
 from uavmec_jax.training.training import Training
@@ -23,6 +26,15 @@ _BYTES_PER_SECOND = 150e6
 
 _KEPT = 2
 """Checkpoints of a shard that are kept."""
+
+
+class _Progress(StrictModel):
+    """What the header of a checkpoint says, besides what it belongs to."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    chunks_done: Annotated[int, Field(ge=0)]
+    seconds: dict[str, Annotated[float, Field(ge=0)]]
 
 
 def interval_s(every_s: float, share: float, size: float, cost_s: float | None = None) -> float:
@@ -101,30 +113,46 @@ class Checkpoints:
             try:
                 progress = self._restore(path, training)
             except StudyError as error:
-                if isinstance(error.__cause__, OSError) and path.exists():
+                if isinstance(error.__cause__, OSError) and _is_file(path):
                     raise error.__cause__ from None  # the file server's fault, not the file's
                 self.log_event("damaged", file=path.name, error=str(error))
                 set_aside(path)
                 training = start()
                 continue
-            for activity, spent in progress["seconds"].items():
+            for activity, spent in progress.seconds.items():
                 training.seconds[activity] = training.seconds.get(activity, 0.0) + spent
             self.log_event("restored", file=path.name, steps=training.steps)
             break
         return training
 
-    def _restore(self, path: Path, training: Training) -> dict[str, Any]:
+    def _restore(self, path: Path, training: Training) -> _Progress:
         with open_checked(path, SCHEMA, "a checkpoint", StudyError) as (facts, arrays):
             if different := [name for name, value in self.identity.items() if facts.get(name) != value]:
                 raise StudyError(f"{path}: belongs to another run: its {', '.join(different)} differ")
-            training.restore(facts["chunks_done"], arrays)
-        return facts
+            progress = validated(_Progress, facts, path, StudyError)
+            try:
+                training.restore(progress.chunks_done, arrays)
+            except UserError:
+                raise
+            except ValueError as error:
+                raise StudyError(f"{path}: does not fit this shard: {error}") from None
+        return progress
 
     def remove(self) -> None:
         """Remove all checkpoints, once the shard is finished."""
-        for path in [*self._generations(), *files_matching(self.folder, f"{CHECKPOINT}-*.damaged")]:
+        for path in [*self._generations(), *self._files(lambda name: is_damaged(name) and name.startswith(CHECKPOINT))]:
             path.unlink(missing_ok=True)
 
     def _generations(self) -> list[Path]:
         """Return the checkpoints of all attempts, the furthest first: after as many chunks, all hold the same state."""
-        return files_matching(self.folder, f"{CHECKPOINT}-*.npz")[::-1]
+        return self._files(lambda name: is_named(name, CHECKPOINT))[::-1]
+
+    def _files(self, is_wanted: Callable[[str], bool]) -> list[Path]:
+        """Return the files of the shard with such names, sorted by name."""
+        paths = [self.folder / name for name in names_in(self.folder) if is_wanted(name)]
+        return [path for path in paths if not is_local(path) or path.is_symlink() or not path.is_dir()]
+
+
+def _is_file(path: Path) -> bool:
+    """Return whether there is a regular file; what is in its place (a pipe, a link to nowhere) is nobody's checkpoint."""
+    return path.is_file() if is_local(path) else path.exists()

@@ -11,13 +11,31 @@ from pathlib import Path
 from typing import Any, Literal
 
 from uavmec_jax.errors import StudyError
-from uavmec_jax.files.locations import files_in_subfolders, files_matching, is_local, reached
-from uavmec_jax.files.locks import is_known_dead
-from uavmec_jax.files.reading import read_json_or_empty, read_text
+from uavmec_jax.files.locations import files_in_subfolders, is_local, names_in, reached
+from uavmec_jax.files.locks import LOCK, OWNER, is_known_dead
+from uavmec_jax.files.parsing import read_json_object
+from uavmec_jax.files.reading import read_text
 from uavmec_jax.files.writing import write_text
+from uavmec_jax.runs.file_names import (
+    FAILURE,
+    LOG,
+    PROGRESS,
+    RESULT,
+    RUN_PLAN,
+    SHARDS,
+    TOUR,
+    is_named,
+    is_ours,
+    is_partial,
+)
 from uavmec_jax.runs.options import RunOptions
+from uavmec_jax.runs.reports import read_failure, read_progress
 from uavmec_jax.runs.run_plan import RunPlan, Shard
+from uavmec_jax.runs.run_plan_schema import check_facts, check_study
+from uavmec_jax.studies.parts import Part, split_study
+from uavmec_jax.studies.population import AgentId, make_agent_ids
 from uavmec_jax.studies.results import RUN, STUDY
+from uavmec_jax.studies.results_schema import check_label
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.studies.study import parse_study, study_toml
 from uavmec_jax.training import host
@@ -31,10 +49,6 @@ _WITH_LEASES = 1
 
 _SILENCE_S = 600.0
 """Seconds without a report after which an attempt elsewhere is shown as stopped."""
-
-RUN_PLAN, LOG, SHARDS, TOUR = "run_plan.json", "log", "shards", "tour.json"
-CHECKPOINT, PROGRESS, RESULT, FAILURE = "checkpoint", "progress", "result", "failed.json"
-"""What an attempt at a shard writes, under its own name, and why the shard failed."""
 
 ShardState = Literal["waiting", "running", "stopped", "failed", "done"]
 
@@ -74,11 +88,15 @@ class RunFolder:
         """Read a run plan.
 
         Raises:
-            StudyError: the folder holds no run; the run plan or the study was altered or is damaged; or another version
-                wrote it; or its object store cannot be reached.
+            StudyError: the folder holds no run; the run plan or the study was altered or is damaged, or they do not fit
+                together; or another version wrote it; or its object store cannot be reached.
         """
         with reached(path):
-            return cls(path, cls._read(path))
+            folder = cls(path, cls._read(path))
+            file = path / RUN_PLAN
+            check_study(folder.facts["plan"], folder.study, file)
+            check_label(folder.facts["label"], folder.study, file)
+            return folder
 
     @staticmethod
     def _read(path: Path) -> dict[str, Any]:
@@ -87,17 +105,15 @@ class RunFolder:
         if not file.exists():
             tour = f"; it holds a tour of `uavmec plan` ({TOUR})" if (path / TOUR).exists() else ""
             raise StudyError(f"{path}: holds no run that can be resumed ({RUN_PLAN} is missing){tour}")
-        try:
-            facts: dict[str, Any] = json.loads(read_text(file, StudyError))
-            schema, digest = facts["schema"], facts["sha256"]
-        except (ValueError, KeyError, TypeError) as error:
-            raise StudyError(f"{file}: cannot be read: {error!r}; plan the study anew in another folder") from None
+        facts = read_json_object(file, StudyError)
+        schema = facts.get("schema")
+        if schema not in (SCHEMA, _WITH_LEASES) or isinstance(schema, bool):
+            raise StudyError(f"{file}: schema is {schema!r}; this version reads {SCHEMA}")
         if schema == _WITH_LEASES and not (path / RUN).exists():
             raise StudyError(f"{path}: was started by a version whose workers held leases; finish it with that version")
-        if schema not in (SCHEMA, _WITH_LEASES):
-            raise StudyError(f"{file}: schema is {schema!r}; this version reads {SCHEMA}")
-        if digest != _digest(facts):
+        if facts.get("sha256") != _digest(facts):
             raise StudyError(f"{file}: was altered or damaged: it does not fit its SHA-256; plan the study anew")
+        check_facts(facts, file)
         if _sha256(read_text(path / STUDY, StudyError)) != facts["study_sha256"]:
             raise StudyError(f"{path / STUDY}: was altered or damaged since the run was planned; run it as a new study")
         return facts
@@ -173,9 +189,52 @@ class RunFolder:
         """Return the file that says why a shard failed."""
         return self.shard_folder(shard) / FAILURE
 
+    def files(self, shard: Shard, kind: str) -> list[Path]:
+        """Return a shard's files of a kind, such as ``CHECKPOINT``, sorted by name; strangers among them are left out."""
+        folder = self.shard_folder(shard)
+        return [folder / name for name in names_in(folder) if is_named(name, kind)]
+
     def results(self, shard: Shard) -> list[Path]:
         """Return the results of a shard: one from each attempt that finished it, all with the same contents."""
-        return files_matching(self.shard_folder(shard), f"{RESULT}-*.npz")
+        return self.files(shard, RESULT)
+
+    def strangers(self) -> list[str]:
+        """Return what lies among the shards and was not written by a run, as paths inside the folder of all shards."""
+        shards = {self.shard_folder(shard).name for shard in self.plan.shards}
+        beside = [name for name in names_in(self.shards_folder) if name not in {LOCK, OWNER, *shards}]
+        inside = [file for file in files_in_subfolders(self.shards_folder) if file.parent.name in shards]
+        strange = [f"{file.parent.name}/{file.name}" for file in inside if not is_ours(file.name)]
+        return sorted([name for name in beside if not is_partial(name)] + strange)
+
+    def check_links(self) -> None:
+        """Check that no folder in which a run writes is a link to a folder elsewhere.
+
+        Raises:
+            StudyError: one is.
+        """
+        folders = [self.path / LOG, self.shards_folder, *(self.shard_folder(shard) for shard in self.plan.shards)]
+        for folder in folders if is_local(self.path) else ():
+            if folder.is_symlink():
+                raise StudyError(
+                    f"{folder}: is a symbolic link; a run writes into its own folder only; remove the link"
+                )
+
+    def agent_ids(self, shard: Shard) -> list[AgentId]:
+        """Return the identities of a shard's agents."""
+        return self._agent_ids[shard.part][shard.first : shard.first + shard.agents]
+
+    @cached_property
+    def parts(self) -> dict[str, Part]:
+        """The parts of the study by name."""
+        return {part.name: part for part in split_study(self.study)}
+
+    @cached_property
+    def _agent_ids(self) -> dict[str, list[AgentId]]:
+        """The identities of the agents of each part."""
+        return {
+            name: [agent_id | part.values for agent_id in make_agent_ids(part.study)]
+            for name, part in self.parts.items()
+        }
 
     def is_closed(self, shard: Shard) -> bool:
         """Return whether a shard is finished or has failed."""
@@ -183,7 +242,7 @@ class RunFolder:
 
     def new_attempt(self, shard: Shard) -> str:
         """Return a name for another attempt at a shard, under which it writes: its number, and what makes it unique."""
-        before = len(files_matching(self.shard_folder(shard), f"{PROGRESS}-*.json"))
+        before = len(self.files(shard, PROGRESS))
         return f"{before + 1:02d}-{secrets.token_hex(3)}"
 
     def states(self) -> Iterator[tuple[Shard, ShardState, dict[str, Any]]]:
@@ -194,23 +253,23 @@ class RunFolder:
             files.setdefault(file.parent.name, []).append(file)
         for shard in self.plan.shards:
             present = sorted(files.get(f"{shard.number:05d}", ()), key=lambda file: file.name)
-            reports = [file for file in present if file.name.startswith(f"{PROGRESS}-")]
+            reports = [file for file in present if is_named(file.name, PROGRESS)]
             attempts = {"attempts": len(reports)}
-            if complete or any(file.name.startswith(f"{RESULT}-") for file in present):
+            if complete or any(is_named(file.name, RESULT) for file in present):
                 yield shard, "done", attempts
             elif any(file.name == FAILURE for file in present):
-                yield shard, "failed", attempts | read_json_or_empty(self.failure(shard))
+                yield shard, "failed", attempts | read_failure(self.failure(shard))
             elif reports:
-                report = read_json_or_empty(reports[-1]) | attempts
+                report = read_progress(reports[-1]) | attempts
                 yield shard, "running" if _is_running(report) else "stopped", report
             else:
                 yield shard, "waiting", {}
 
     def remove_partial_files(self) -> None:
-        """Remove what attempts that were killed have left of checkpoints; only where no other process works."""
-        if is_local(self.shards_folder):
-            for file in self.shards_folder.glob("*/.*.part.*"):
-                file.unlink(missing_ok=True)
+        """Remove what attempts that were killed have left of files; only where no other process works."""
+        for shard in self.plan.shards if is_local(self.path) else ():
+            for name in filter(is_partial, names_in(self.shard_folder(shard))):
+                (self.shard_folder(shard) / name).unlink(missing_ok=True)
 
 
 def _is_running(report: dict[str, Any]) -> bool:

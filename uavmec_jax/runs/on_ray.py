@@ -11,12 +11,13 @@ from uavmec_jax.cluster.connection import Cluster
 from uavmec_jax.cluster.tasks import GRACE_S, ClusterLostError, Task, TaskError, TaskRun
 from uavmec_jax.cluster.worker import node_name
 from uavmec_jax.errors import StudyError, UserError
-from uavmec_jax.files.locations import absolute, files_matching, to_path
-from uavmec_jax.files.reading import read_json_or_empty
+from uavmec_jax.files.locations import absolute, to_path
 from uavmec_jax.runs.attempt import Attempt
-from uavmec_jax.runs.folder import CHECKPOINT, LOG, PROGRESS, RunFolder
+from uavmec_jax.runs.file_names import CHECKPOINT, LOG, PROGRESS
+from uavmec_jax.runs.folder import RunFolder
 from uavmec_jax.runs.in_process import OnProgress, not_written, record_failure
 from uavmec_jax.runs.log import RunLog
+from uavmec_jax.runs.reports import read_progress
 from uavmec_jax.runs.run_plan import Shard
 from uavmec_jax.runs.shard_runner import ShardRunner
 from uavmec_jax.runs.signals import StopSignal
@@ -60,7 +61,7 @@ def run_on_ray(
             return absolute(folder.path), folder.fingerprint, shard.number, attempt, worker
 
         def position() -> list[str]:
-            return [file.name for file in files_matching(folder.shard_folder(shard), f"{CHECKPOINT}-*.npz")]
+            return [file.name for file in folder.files(shard, CHECKPOINT)]
 
         return Task(shard.number, attempt_shard, arguments, position)
 
@@ -87,7 +88,7 @@ def run_on_ray(
 
 def _where(folder: RunFolder, shard: Shard, attempt: str) -> dict[str, Any]:
     """Return shard, attempt and node of an attempt, as they stand in the log; the node only if the attempt began there."""
-    report = read_json_or_empty(folder.shard_folder(shard) / f"{PROGRESS}-{attempt}.json")
+    report = read_progress(folder.shard_folder(shard) / f"{PROGRESS}-{attempt}.json")
     node = {"node": report["node"]} if "node" in report else {}
     return {"shard": shard.number, "attempt": attempt} | node
 

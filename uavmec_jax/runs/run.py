@@ -14,7 +14,9 @@ from uavmec_jax.errors import StudyError
 from uavmec_jax.files.locations import is_local, reached, remove_folder, to_path
 from uavmec_jax.files.locks import lock_folder
 from uavmec_jax.files.output_folders import check_directory, check_empty
-from uavmec_jax.runs.folder import LOG, RUN_PLAN, SHARDS, RunFolder
+from uavmec_jax.files.writing import writing_to
+from uavmec_jax.runs.file_names import LOG, RUN_PLAN, SHARDS
+from uavmec_jax.runs.folder import RunFolder
 from uavmec_jax.runs.in_process import OnProgress, run_here
 from uavmec_jax.runs.log import OnEvent, RunLog, tensorboard_writer
 from uavmec_jax.runs.on_ray import run_on_ray
@@ -33,6 +35,9 @@ from uavmec_jax.studies.schema import Study
 from uavmec_jax.studies.shard_result import ShardResult
 from uavmec_jax.training.machine import probe_node
 from uavmec_jax.training.population import Progress
+
+_NAMED = 20
+"""Strangers in the folder of a run that its log names."""
 
 RewardFunction = Callable[[Mapping[str, Any]], Any]
 
@@ -74,7 +79,7 @@ def run_study(
         StudyError: the population does not fit in memory, the directory cannot take a run or another process works in it,
             shards failed, ``reward`` is given beside an axis of rewards, a package is not installed, Ray cannot be reached,
             or is given without a directory or with a reward function; the directory is a URL, and its object store cannot
-            be reached or written to.
+            be reached or written to; a folder cannot be written to.
     """
     check_shard_size(shard_size)  # before Ray is started
     if reward is not None and "reward" in study.axes:
@@ -98,7 +103,7 @@ def run_study(
             label["reward_function"] = getattr(reward, "__qualname__", repr(reward))
         if path is None:
             return _run_in_memory(study, plan, ShardRunner(study, plan, reward), label, on_progress)
-        with lock_folder(path / SHARDS, path):
+        with writing_to(path, StudyError), lock_folder(path / SHARDS, path):
             check_empty(path)
             folder = RunFolder.create(path, study, plan, options, label)
             return _run(folder, reward, cluster, on_progress, on_event)
@@ -130,7 +135,7 @@ def resume_run(
 
     Raises:
         StudyError: the directory holds no run, the run plan is damaged, another process works in it, its object store
-            cannot be reached, or the run needs its reward function or was planned with other code.
+            cannot be reached, it cannot be written to, or the run needs its reward function or was planned with other code.
     """
     ray = RayOptions.of(ray)
     with reached(directory) as path:
@@ -147,7 +152,9 @@ def resume_run(
         _check_location(path, ray)
         if not other_code:
             folder.check_code()
-        with lock_folder(folder.shards_folder, path, take_over=take_over), connected(ray) as cluster:
+        folder.check_links()
+        writing, lock = writing_to(path, StudyError), lock_folder(folder.shards_folder, path, take_over=take_over)
+        with writing, lock, connected(ray) as cluster:
             if folder.complete:  # by the process that has just let go of it
                 remove_folder(folder.shards_folder)
                 return load_results(path)
@@ -201,6 +208,8 @@ def _run(
 ) -> Results:
     """Run all shards that are not finished, and assemble the results."""
     log = RunLog(folder.path / LOG, tensorboard=folder.options.tensorboard and cluster is None, on_event=on_event)
+    if strangers := folder.strangers():
+        log.event("ignored", number=len(strangers), names=strangers[:_NAMED])
     with StopSignal() as stop:
         try:
             damaged = None

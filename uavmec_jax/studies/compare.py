@@ -52,6 +52,10 @@ class Side:
             StudyError: there is no such policy, axis or agent.
         """
         agents, column = self.results.agents, f"{self.policy.replace('-', '_')}_lifetime"
+        if agents.empty:
+            raise StudyError(
+                f"{self.results.study.name}: none of its agents is finished; resume the run, or wait for it"
+            )
         if column not in agents:
             policies = ", ".join(name.replace("_", "-") for name in self.results.policies)
             raise StudyError(f"{self.results.study.name}: has no policy {self.policy!r}; it has {policies}")

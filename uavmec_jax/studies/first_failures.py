@@ -67,7 +67,7 @@ def first_failure_groups(results: Results) -> dict[str, pd.DataFrame]:
 
 def place_frames(results: Results) -> dict[str, pd.DataFrame]:
     """Return the tables that a study of places has besides its cells: ``first_failures`` and ``claims``; else none."""
-    if not has_places(results):
+    if not has_places(results) or not len(results.agents):
         return {}
     return {"first_failures": first_failure_counts(results), "claims": traffic_claims(results)}
 

@@ -88,7 +88,7 @@ class Results:
             shards: results of the finished shards, in the order of the run plan.
             agents: number of agents in the whole study.
         """
-        results, shards = cls(study, dict(label)), list(shards)
+        results, shards = cls(study, dict(label), agents=_no_agents(study)), list(shards)
         curves: dict[str, list[Mapping]] = {}
         weights = []
         for shard in shards:
@@ -254,6 +254,11 @@ class Results:
             agents[row.get("algorithm", self.study.algorithm)].append(row)
         finished = {name: agent_ids for name, agent_ids in agents.items() if agent_ids}
         return policy_collection(self.study, finished, self.weights)
+
+
+def _no_agents(study: Study) -> pd.DataFrame:
+    """Return the tidy table of no agents."""
+    return pd.DataFrame(columns=["seed", *cell_axes(study)])
 
 
 def _concatenate(pieces: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:

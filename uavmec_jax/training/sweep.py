@@ -194,10 +194,10 @@ def _bind(
 
 def _batch_hyper(algorithm: str, registered: RegisteredAlgorithm, hyper: Mapping[str, Any], n: int) -> Any:
     """Return the hyperparameters of ``n`` agents, leaves ``[A]``; those not given have their defaults."""
-    for name in hyper:
-        if name not in registered.traced:
-            hint = suggest(name, registered.traced)
-            raise StudyError(f"hyper has {name!r}, which is not a hyperparameter of {algorithm}; {hint}")
+    for given in hyper:
+        if given not in registered.traced:
+            hint = suggest(given, registered.traced)
+            raise StudyError(f"hyper has {given!r}, which is not a hyperparameter of {algorithm}; {hint}")
     leaves = {}
     for field in dataclasses.fields(registered.hyper):
         name: str = field.name

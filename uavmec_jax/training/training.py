@@ -205,12 +205,19 @@ class Training:
         Raises:
             ValueError: the arrays are those of another training.
         """
+        if not 0 <= chunks_done <= len(self.trainer.chunks):
+            raise ValueError(f"chunks_done is {chunks_done}; the training has {len(self.trainer.chunks)} chunks")
         validations = sum(chunk.validates for chunk in self.trainer.chunks[:chunks_done])
-        for name, count in (("episode_slots", chunks_done), ("episodes", chunks_done), ("scores", validations)):
-            curve = list(arrays[f"curves/{name}"]) if count else []
-            if len(curve) != count:
-                raise ValueError(f"curves/{name} has {len(curve)} entries; it should have {count}")
-            setattr(self, name, curve)
+        agents = self.trainer.partition.shard_size
+        for name, kind, count in (
+            ("episode_slots", "i", chunks_done),
+            ("episodes", "i", chunks_done),
+            ("scores", "f", validations),
+        ):
+            curve = arrays.get(f"curves/{name}") if count else np.empty((0, agents), kind)
+            if curve is None or (curve.shape, curve.dtype.kind) != ((count, agents), kind):
+                raise ValueError(f"curves/{name} is missing, or not {count} x {agents} numbers")
+            setattr(self, name, list(curve))
         for number, batch in enumerate(self.group_batches):
 
             def leaf_of(path: Any, old: Any, number: int = number) -> Any:
