@@ -39,6 +39,12 @@ def read_text(path: Path, error: type[UserError], encoding: str = "utf-8", *, ma
         raise error(f"{path}: cannot be read: {where}") from None
 
 
+def read_resource(resource: Any) -> str:
+    """Read a text file that ships with the package."""
+    text: str = resource.read_text(encoding="utf-8")
+    return text
+
+
 def read_bytes(path: Path, error: type[UserError], *, max_bytes: int = MAX_TEXT_BYTES) -> bytes:
     """Read a file.
 

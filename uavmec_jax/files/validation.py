@@ -15,7 +15,29 @@ from uavmec_jax.errors import UserError
 from_array = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
 """Converts lists for fields that are tuples: TOML and JSON have arrays only, and strict models do not convert them."""
 
-Range = Annotated[tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]], from_array]
+LARGEST = 1e12
+"""Largest size of a number: far beyond any quantity in SI units, and far from overflow in float32."""
+
+SMALLEST = 1e-12
+"""Smallest size of a number that is not 0: in float32, what is much closer to 0 is 0, and divides to infinity."""
+
+LARGEST_WHOLE = 2**31 - 1
+"""Largest whole number where nothing else is said: that of int32."""
+
+
+def _check_size(value: float) -> float:
+    if LARGEST < abs(value) < math.inf:
+        raise PydanticCustomError("too_large", f"Input should be at most {LARGEST:g} in size")
+    if 0 < abs(value) < SMALLEST:
+        raise PydanticCustomError("too_small", f"Input should be 0, or at least {SMALLEST:g} in size")
+    return value
+
+
+usual_size = AfterValidator(_check_size)
+"""Checks that a number is 0, infinite where that is allowed, or of a size from :data:`SMALLEST` to :data:`LARGEST`."""
+
+_End = Annotated[float, Field(ge=0), usual_size]
+Range = Annotated[tuple[_End, _End], from_array]
 """``[low, high]``."""
 
 
@@ -47,12 +69,13 @@ class StrictModel(BaseModel):
 def model_from_dataclasses(name: str, *declarations: type, leave_out: tuple[str, ...] = ()) -> Any:
     """Make a strict model with the fields, defaults and bounds of dataclasses.
 
-    Numbers have to be at least 0 unless their field has bounds of its own.
+    Numbers have to be at least 0 unless their field has bounds of its own, and whole ones at most :data:`LARGEST_WHOLE`.
+    Those that are not whole have a :data:`usual_size`.
 
     Args:
         name: name of the model.
         declarations: dataclasses. The metadata of a field may hold bounds (``gt``, ``ge``, ``lt``, ``le``), the allowed
-            values (``choices``), or the bounds of the integers in a tuple of any length (``items``).
+            values (``choices``), or the bounds of the integers in a tuple (``items``) and of its length (``max_length``).
         leave_out: fields that files may not set.
     """
     fields = {
@@ -72,12 +95,12 @@ def _field(field: dataclasses.Field) -> Any:
     if isinstance(default, bool):
         return bool, default
     if isinstance(default, int):
-        return Annotated[int, Field(**{"ge": 0, **bounds})], default
+        return Annotated[int, Field(**{"ge": 0, "le": LARGEST_WHOLE, **bounds})], default
     if isinstance(default, float):
-        bounds = bounds or {"ge": 0}
-        return Annotated[float, Field(**bounds, allow_inf_nan=math.isinf(default))], default
-    if "items" in field.metadata:  # a tuple of any length
-        return Annotated[tuple[Annotated[int, Field(**field.metadata["items"])], ...], from_array], default
+        return Annotated[float, Field(**(bounds or {"ge": 0}), allow_inf_nan=math.isinf(default)), usual_size], default
+    if "items" in field.metadata:
+        length = Field(max_length=field.metadata.get("max_length"))
+        return Annotated[tuple[Annotated[int, Field(**field.metadata["items"])], ...], length, from_array], default
     return Range, default
 
 

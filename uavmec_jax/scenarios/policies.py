@@ -7,7 +7,6 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -72,10 +71,8 @@ class TrainedPolicy:
             PolicyError: there are no such weights, or they are not finite.
         """
         weights = jax.tree.map(lambda leaf: jnp.asarray(leaf[index]), collection.weights_of(which, name))
-        try:
-            chex.assert_tree_all_finite(weights)
-        except AssertionError:
-            raise PolicyError(f"the {which} weights of {name} are not finite: training diverged") from None
+        if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(weights)):
+            raise PolicyError(f"the {which} weights of {name} are not finite: training diverged")
         alone = select_agent(collection, name, index, which)
         axes = alone.agents[name][0]
         algorithm, hyper = alone.algorithm(name), alone.hyper(name, axes)

@@ -15,7 +15,7 @@ from uavmec_jax.agents.registry import ALGORITHMS
 from uavmec_jax.env.rewards import REWARDS, TERMS
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files.parsing import parse_toml
-from uavmec_jax.files.reading import read_text
+from uavmec_jax.files.reading import read_resource, read_text
 from uavmec_jax.files.validation import StrictModel, describe_error, expectation, from_array, suggest
 from uavmec_jax.studies.population import seeds_of
 from uavmec_jax.studies.schema import Study
@@ -116,7 +116,7 @@ def load_space(name_or_path: str, overrides: Mapping[str, Any] | None = None) ->
     """
     library = shipped_spaces()
     if name_or_path in library:
-        text = library[name_or_path].read_text(encoding="utf-8")
+        text = read_resource(library[name_or_path])
     elif not Path(name_or_path).is_file():
         hint = suggest(Path(name_or_path).stem, library)
         raise StudyError(f"{name_or_path}: neither a file of a search space nor a shipped one; {hint}")

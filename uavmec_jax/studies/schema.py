@@ -1,7 +1,7 @@
 """The schema of study files.
 
-The numbers of Table 1 and the hyperparameters are declared once (:class:`Params`, :data:`ALGORITHMS`); their models here are
-made from those declarations.
+The numbers of Table 1 and the hyperparameters are declared once (:class:`Params`, :data:`ALGORITHMS`); their models
+(:data:`SETTINGS`, :class:`ParamsSettings`) are made from those declarations.
 """
 
 from collections.abc import Sequence
@@ -10,10 +10,11 @@ from typing import Annotated, Any, Literal, get_args
 import pydantic
 from pydantic import Field
 
-from uavmec_jax.agents.registry import ALGORITHMS, SCENARIO_SETTINGS, check_end
+from uavmec_jax.agents.registry import ALGORITHMS, check_end
+from uavmec_jax.agents.settings import SETTINGS
 from uavmec_jax.env.fleet import MAX_UAVS
 from uavmec_jax.env.rewards import DEFAULT_REWARD, LOG_GUARDS
-from uavmec_jax.files.validation import StrictModel, from_array, model_from_dataclasses
+from uavmec_jax.files.validation import StrictModel, from_array
 from uavmec_jax.planning.beam import WIDTH as BEAM_WIDTH
 from uavmec_jax.planning.heuristics import FLEET_HEURISTICS, HEURISTICS
 from uavmec_jax.planning.rollout_planner import SAMPLES as ROLLOUT_SAMPLES
@@ -24,18 +25,10 @@ from uavmec_jax.scenarios.settings import ParamsSettings, check_ranges
 from uavmec_jax.studies.axes import TRAFFIC_WEIGHTS, check_axes, check_reward, expected_depots
 
 
-def _algorithm_settings(name: str) -> Any:
-    """Make the model of an algorithm's settings, traced and static."""
-    registered = ALGORITHMS[name]
-    return model_from_dataclasses(
-        f"{name.upper()}Settings", registered.hyper, registered.spec, leave_out=SCENARIO_SETTINGS
-    )
-
-
-DQNSettings: Any = _algorithm_settings("dqn")
-PQNSettings: Any = _algorithm_settings("pqn")
-PPOSettings: Any = _algorithm_settings("ppo")
-A2CSettings: Any = _algorithm_settings("a2c")
+DQNSettings: Any = SETTINGS["dqn"]
+PQNSettings: Any = SETTINGS["pqn"]
+PPOSettings: Any = SETTINGS["ppo"]
+A2CSettings: Any = SETTINGS["a2c"]
 
 AlgorithmName: Any = Literal[(*ALGORITHMS, "none")]
 Guard: Any = Literal[LOG_GUARDS]

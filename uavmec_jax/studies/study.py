@@ -11,7 +11,7 @@ import tomli_w
 from uavmec_jax.agents.registry import ALGORITHMS
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files.parsing import parse_toml
-from uavmec_jax.files.reading import read_text
+from uavmec_jax.files.reading import read_resource, read_text
 from uavmec_jax.files.validation import describe_error, suggest
 from uavmec_jax.scenarios.settings import unused_params
 from uavmec_jax.studies.schema import Study
@@ -36,7 +36,7 @@ def load_study(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
     """
     library = shipped_studies()
     if str(name_or_path) in library:
-        source, text = str(name_or_path), library[str(name_or_path)].read_text(encoding="utf-8")
+        source, text = str(name_or_path), read_resource(library[str(name_or_path)])
     else:
         path = Path(name_or_path)
         source = str(path)
