@@ -3,6 +3,7 @@
 import dataclasses
 import difflib
 import math
+import re
 from collections.abc import Iterable, Sequence
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
@@ -56,7 +57,7 @@ PrintableName = Annotated[str, Field(min_length=1, max_length=80), AfterValidato
 _Model = TypeVar("_Model", bound=BaseModel)
 
 _BOUNDS = ("gt", "ge", "lt", "le")
-_TYPE_TAGS = ("int", "str", "float", "bool")
+_TYPE_TAG = re.compile(r"int|str|float|bool|(constrained-|tuple\[|dict\[|list\[|function-).*", re.DOTALL)
 """Parts that pydantic adds to the location of an error in a union."""
 
 
@@ -140,10 +141,10 @@ def describe_error(source: str, error: pydantic.ValidationError, model: type[Bas
         model: the model that was validated.
         data: the data; if they are given, an error in a list of tables names the table.
     """
-    first = error.errors()[0]
+    first = _first_of(error)
     if first["type"] == "value_error":
         return f"{source}: {expectation(first)}"
-    location = [part for part in first["loc"] if part not in _TYPE_TAGS]
+    location = _without_tags(first)
     table, path = _split_location(location, model, data)
     subject = f"{source}: {table}{'.'.join(map(str, path))}".rstrip()
     if first["type"] == "extra_forbidden":
@@ -154,6 +155,22 @@ def describe_error(source: str, error: pydantic.ValidationError, model: type[Bas
     if first["type"] == "missing":
         return f"{subject} is missing"
     return f"{subject} is {first['input']!r}; {expectation(first)}"
+
+
+def _first_of(error: pydantic.ValidationError) -> Any:
+    """Return the first of pydantic's errors; of those about one value of a union, that which is deepest inside it.
+
+    The others say that the value should be of another type, such as a list where a table is given.
+    """
+    errors = error.errors()
+    whole = _without_tags(errors[0])
+    same = [one for one in errors if _without_tags(one)[: len(whole)] == whole]
+    return max(same, key=lambda one: len(_without_tags(one)))
+
+
+def _without_tags(error: Any) -> list[Any]:
+    """Return the location of an error without the parts that pydantic adds in a union."""
+    return [part for part in error["loc"] if not (isinstance(part, str) and _TYPE_TAG.fullmatch(part))]
 
 
 def _split_location(location: list[Any], model: type[BaseModel], data: Any) -> tuple[str, list[Any]]:

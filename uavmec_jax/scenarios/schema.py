@@ -7,7 +7,13 @@ from pydantic_core import PydanticCustomError
 
 from uavmec_jax.env.fleet import DepotKind
 from uavmec_jax.files.validation import PrintableName, PrintableText, StrictModel, from_array, usual_size
-from uavmec_jax.scenarios.settings import MAX_POSITION_M, MIN_CAPACITY_J, ParamsSettings
+from uavmec_jax.scenarios.settings import ParamsSettings
+
+MAX_POSITION_M = 1e7
+"""Largest size of a coordinate, m from the origin."""
+
+MIN_CAPACITY_J = 1e-3
+"""Smallest battery capacity of a device, J."""
 
 _Power = Annotated[float, Field(ge=0), usual_size]
 _Positive = Annotated[float, Field(gt=0), usual_size]
