@@ -23,7 +23,7 @@ KINDS = ("best", "last")
 
 _MAX_AGENTS = 1_000_000
 
-_AxisValue = bool | int | float | PrintableText | None  # None: an infinite number, which JSON lacks
+_AxisValue = PrintableText | bool | int | float | None  # None: an infinite number, which JSON lacks
 _Agent = dict[PrintableText, _AxisValue]
 
 _COMPARED = (
