@@ -14,7 +14,9 @@ from uavmec_jax.scenarios.load import load_scenario
 from uavmec_jax.scenarios.scenario_files import load_scenario_file, scenario_text
 from uavmec_jax.scenarios.state_files import load_state
 
-COMMAS = "name,lon,lat,type,task,capacity_j\nnorth,9.98,53.54,Firefly,HAAR,60000\nsouth,9.981,53.541,Firefly,HAAR,60000\n"
+COMMAS = (
+    "name,lon,lat,type,task,capacity_j\nnorth,9.98,53.54,Firefly,HAAR,60000\nsouth,9.981,53.541,Firefly,HAAR,60000\n"
+)
 
 
 def refused(path, read=load_scenario_file, error=ScenarioError):
@@ -39,7 +41,10 @@ def test_a_table_with_semicolons_or_tabs_is_read(tmp_path, separator):
 
 def test_a_table_without_the_columns_of_devices_names_those_it_has_and_those_it_wants(tmp_path):
     message = refused(write(tmp_path, "id,height\n1,20\n", "towers.csv"))
-    assert "has the columns id, height; a device needs name, capacity_j, and x_m and y_m or lon and lat; known: " in message
+    assert (
+        "has the columns id, height; a device needs name, capacity_j, and x_m and y_m or lon and lat; known: "
+        in message
+    )
     assert "standby_power_w" in message
 
 
@@ -81,20 +86,47 @@ BAD_TOML = {
     "4,000 digits": (DEVICE.replace("5e4", "9" * 4000), "a whole number of more than 40 digits"),
     "20,000 brackets": (f"region = {DEEP}\n{DEVICE}", "is nested too deep"),
     "20,000 tables": (f"{DEVICE}\n{'a.' * 20_000}a = 1\n", "is nested too deep"),
-    "tiny capacity": (DEVICE.replace("5e4", "1e-300"), "device 1 (a): capacity_j is 1e-300; it should be greater than or"),
-    "huge capacity": (DEVICE.replace("5e4", "1e300"), "device 1 (a): capacity_j is 1e+300; it should be at most 1e+12 in"),
-    "negative position": (DEVICE.replace("x_m = 1.0", "x_m = -5.0"), "device 1 (a): lies at -5, 1 m, outside the region"),
-    "absurd position": (DEVICE.replace("x_m = 1.0", "x_m = 1e30"), "x_m is 1e+30; it should be less than or equal to 1000"),
-    "tiny power": (f"{DEVICE}standby_power_w = 1e-300\n", "standby_power_w is 1e-300; it should be 0, or at least 1e-12"),
-    "huge rate": (f"{DEVICE}processing_rate_bytes_s = 1e300\n", "processing_rate_bytes_s is 1e+300; it should be at most"),
+    "tiny capacity": (
+        DEVICE.replace("5e4", "1e-300"),
+        "device 1 (a): capacity_j is 1e-300; it should be greater than or",
+    ),
+    "huge capacity": (
+        DEVICE.replace("5e4", "1e300"),
+        "device 1 (a): capacity_j is 1e+300; it should be at most 1e+12 in",
+    ),
+    "negative position": (
+        DEVICE.replace("x_m = 1.0", "x_m = -5.0"),
+        "device 1 (a): lies at -5, 1 m, outside the region",
+    ),
+    "absurd position": (
+        DEVICE.replace("x_m = 1.0", "x_m = 1e30"),
+        "x_m is 1e+30; it should be less than or equal to 1000",
+    ),
+    "tiny power": (
+        f"{DEVICE}standby_power_w = 1e-300\n",
+        "standby_power_w is 1e-300; it should be 0, or at least 1e-12",
+    ),
+    "huge rate": (
+        f"{DEVICE}processing_rate_bytes_s = 1e300\n",
+        "processing_rate_bytes_s is 1e+300; it should be at most",
+    ),
     "slow": (f"[params]\nuav_speed_m_s = 1e-320\n{DEVICE}", "params.uav_speed_m_s is "),
     "endless": (f"[params]\nhorizon_s = 1e300\n{DEVICE}", "params.horizon_s is 1e+300; it should be "),
-    "many pads": (f"{DEVICE}[[depot]]\nx_m = 1.0\ny_m = 1.0\npads = 1e300\n", "pads is 1e+300; it should be at most 1e+12"),
+    "many pads": (
+        f"{DEVICE}[[depot]]\nx_m = 1.0\ny_m = 1.0\npads = 1e300\n",
+        "pads is 1e+300; it should be at most 1e+12",
+    ),
     "no name": (DEVICE.replace('"a"', '""'), "name is ''; String should have at least 1 character"),
     "long name": (DEVICE.replace('"a"', f'"{"a" * 81}"'), "String should have at most 80 characters"),
-    "terminal's name": (DEVICE.replace('"a"', '"\\u001b[2J"'), "it should be one line of characters that can be printed"),
+    "terminal's name": (
+        DEVICE.replace('"a"', '"\\u001b[2J"'),
+        "it should be one line of characters that can be printed",
+    ),
     "name of the scenario": (f'name = "a\\nb"\n{DEVICE}', "name is 'a\\nb'; it should be one line"),
-    "array as a number": (DEVICE.replace("5e4", "[1, 2]"), "device 1 (a): capacity_j is [1, 2]; it should be a valid number"),
+    "array as a number": (
+        DEVICE.replace("5e4", "[1, 2]"),
+        "device 1 (a): capacity_j is [1, 2]; it should be a valid number",
+    ),
     "table as a list": ("device = 3\n", "device is 3; it should be a valid tuple"),
     "number as params": (f"params = 3\n{DEVICE}", "params is 3; it should be a valid dictionary"),
 }
@@ -161,7 +193,9 @@ def shores(tmp_path, longitude=lambda lon: lon, *, origin=False, ending=".csv", 
     placed = [(name, longitude(lon), lat) for name, lon, lat in SHORES]
     if ending == ".csv":
         rows = [f"{name},{lon},{lat},Firefly,HAAR,60000" for name, lon, lat in placed]
-        return load_scenario_file(write(tmp_path, "\n".join(["name,lon,lat,type,task,capacity_j", *rows]), "shores.csv"))
+        return load_scenario_file(
+            write(tmp_path, "\n".join(["name,lon,lat,type,task,capacity_j", *rows]), "shores.csv")
+        )
     head = ["origin = [179.998, -16.783]\n[params]\nregion_m = [500.0, 500.0]"] if origin else []
     head += [f"region = {json.dumps(region)}"] if region else []
     device = '[[device]]\nname = "{}"\nlon = {}\nlat = {}\ntype = "Firefly"\ntask = "HAAR"\ncapacity_j = 60000.0'
@@ -198,7 +232,9 @@ def test_everything_just_east_of_the_antimeridian(tmp_path, far_west):
 
 
 def test_the_first_device_may_lie_east_of_the_antimeridian(tmp_path):
-    rows = "name,lon,lat,type,task,capacity_j\ne,-179.999,-16.781,Firefly,HAAR,6e4\nw,179.9985,-16.78,Firefly,HAAR,6e4\n"
+    rows = (
+        "name,lon,lat,type,task,capacity_j\ne,-179.999,-16.781,Firefly,HAAR,6e4\nw,179.9985,-16.78,Firefly,HAAR,6e4\n"
+    )
     scenario = load_scenario_file(write(tmp_path, rows, "two.csv"))
     assert scenario.origin == (179.9985, -16.781)
     assert_array_equal(np.round(hops(scenario)), [288])
@@ -211,7 +247,7 @@ def test_an_origin_west_of_the_antimeridian_counts_metres_across_it(tmp_path):
 
 
 def test_metres_across_the_antimeridian_come_out_within_180_degrees(tmp_path):
-    text = f'origin = [179.998, -16.783]\n{DEVICE.replace("x_m = 1.0", "x_m = 320.0")}'
+    text = f"origin = [179.998, -16.783]\n{DEVICE.replace('x_m = 1.0', 'x_m = 320.0')}"
     scenario = load_scenario_file(write(tmp_path, text))
     assert np.allclose(scenario.geographic(np.asarray(scenario.layout.position))[0, 0], -179.998994, rtol=0, atol=1e-5)
     assert abs(scenario.geographic(np.array([320.0, 1.0]))[0]) <= 180

@@ -95,8 +95,14 @@ BAD_HEADERS = {
     "unknown setting": ({"settings.dqn.gama": 0.9}, "settings.dqn: gama is not a setting; did you mean 'gamma'?"),
     "text as a number": ({"settings.dqn.gamma": "high"}, "settings.dqn: gamma is 'high'; it should be a valid number"),
     "out of bounds": ({"settings.dqn.age_scale": -1.0}, "settings.dqn: age_scale is -1.0; it should be greater than 0"),
-    "tiny": ({"settings.dqn.age_scale": 1e-300}, "settings.dqn: age_scale is 1e-300; it should be 0, or at least 1e-12"),
-    "huge network": ({"settings.dqn.hidden": [10**9]}, "hidden.0 is 1000000000; it should be less than or equal to 4096"),
+    "tiny": (
+        {"settings.dqn.age_scale": 1e-300},
+        "settings.dqn: age_scale is 1e-300; it should be 0, or at least 1e-12",
+    ),
+    "huge network": (
+        {"settings.dqn.hidden": [10**9]},
+        "hidden.0 is 1000000000; it should be less than or equal to 4096",
+    ),
     "deep network": ({"settings.dqn.hidden": [4] * 100_000}, "hidden"),
     "number beyond int64": ({"settings.dqn.learning_starts": 10**30}, "learning_starts is 1"),
     "unknown choice": ({"settings.dqn.observation": "all"}, "observation is 'all'; it should be 'paper' or 'full'"),
@@ -111,7 +117,10 @@ BAD_HEADERS = {
     "agent as a number": ({"agents.dqn.1": 3}, "agents.dqn.1 is 3; it should be a valid dictionary"),
     "one agent too many": ({"agents.dqn": HEADER["agents"]["dqn"] * 2}, "its weights do not fit its dqn network"),
     "table in an agent": ({"agents.dqn.0.seed": {"a": 1}}, "agents.dqn.0.seed is {'a': 1}"),
-    "agent's own setting": ({"agents.dqn.1.gamma": 7.0}, "agent 2 of dqn: gamma is 7.0; it should be less than or equal"),
+    "agent's own setting": (
+        {"agents.dqn.1.gamma": 7.0},
+        "agent 2 of dqn: gamma is 7.0; it should be less than or equal",
+    ),
     "terminal's words": ({"agents.dqn.0.place": "\x1b[2J"}, "it should be one line of characters that can be printed"),
     "drawn as text": ({"drawn": "drawn"}, "drawn is 'drawn'"),
     "drawn without parameters": ({"drawn": {"scenarios": DRAWN["scenarios"]}}, "drawn.params is missing"),
@@ -176,3 +185,10 @@ def test_the_header_of_a_run_is_as_strict(tmp_path):
     write_with(tmp_path / "run" / "weights.npz", {"n_devices": True})
     with pytest.raises(PolicyError, match="n_devices is True; it should be a valid integer"):
         load_policy(tmp_path / "run", seed=0)
+
+
+@pytest.mark.parametrize("path", ["a\0b.npz", "a" * 5000, f"{'a/' * 3000}b.npz", "", "/dev/zero"])
+def test_what_is_the_path_of_no_policy_is_refused_at_once(path):
+    with pytest.raises(PolicyError) as error:
+        load_policy(path)
+    assert len(str(error.value)) <= 400

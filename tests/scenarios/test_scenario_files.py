@@ -99,7 +99,10 @@ BAD = {
         DEVICE.replace("Firefly", "x") + "active_power_w = 1.0",
         "type is 'x', which the tables do not list",
     ),
-    "capacity": (DEVICE.replace("5e4", "0"), "device 1 (a): capacity_j is 0; it should be greater than or equal to 0.001"),
+    "capacity": (
+        DEVICE.replace("5e4", "0"),
+        "device 1 (a): capacity_j is 0; it should be greater than or equal to 0.001",
+    ),
     "no capacity": (DEVICE.replace("capacity_j = 5e4", ""), "device 1 (a): capacity_j is missing"),
     "hop": (
         "[params]\nuav_battery_j = 10.0\n" + DEVICE,

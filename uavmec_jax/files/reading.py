@@ -71,6 +71,14 @@ def digest_of(path: Path, error: type[UserError]) -> str:
     return digest.hexdigest()
 
 
+def is_file(path: Path) -> bool:
+    """Return whether there is a regular file; no text that cannot be the name of one raises anything."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
 @contextmanager
 def opened(path: Path, error: type[UserError]) -> Iterator[Any]:
     """Yield a regular file of this machine, or a file in a store, open for reading.

@@ -1,5 +1,6 @@
 """Lines and polygons of maps that cross the antimeridian, cut there as GeoJSON wants it (RFC 7946, section 3.1.9)."""
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ def line_geometry(places: Float[np.ndarray, "p 2"]) -> tuple[str, list[Any]]:
     line = _continuous(places)
     world = _world(line[0, 0], line[1, 0])
     parts: list[list[list[float]]] = [[_on_map(line[0], world)]]
-    for here, there in zip(line[:-1], line[1:], strict=True):
+    for here, there in itertools.pairwise(line):
         while (step := int(np.sign(_world(there[0], here[0]) - world))) != 0:
             crossing = _crossing(here, there, 360.0 * world + 180.0 * step)
             parts[-1].append(_on_map(crossing, world))
@@ -52,7 +53,7 @@ def _crossing(here: Float[np.ndarray, "2"], there: Float[np.ndarray, "2"], longi
 
 def _clip(ring: Float[np.ndarray, "m 2"], longitude: float, side: float) -> Float[np.ndarray, "k 2"]:
     """Return the part of a polygon that lies east (``side`` 1) or west (-1) of a longitude (Sutherland and Hodgman, 1974)."""
-    kept: list[Float[np.ndarray, "2"]] = []
+    kept: list[np.ndarray] = []
     for here, there in zip(ring, np.roll(ring, -1, axis=0), strict=True):
         before, after = side * (here[0] - longitude), side * (there[0] - longitude)
         if before >= 0:

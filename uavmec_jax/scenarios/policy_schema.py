@@ -72,7 +72,9 @@ def check_header(path: Path, header: Mapping[str, Any]) -> None:
     checked = validated(PolicyHeader, dict(header), path, PolicyError)
     for name, settings in checked.settings.items():
         if name not in ALGORITHMS:
-            raise PolicyError(f"{path}: settings.{name} is not an algorithm of this version; {suggest(name, ALGORITHMS)}")
+            raise PolicyError(
+                f"{path}: settings.{name} is not an algorithm of this version; {suggest(name, ALGORITHMS)}"
+            )
         if name not in checked.agents:
             raise PolicyError(f"{path}: agents.{name} is missing; settings.{name} is given")
         _check_settings(path, name, settings, checked)
@@ -110,7 +112,9 @@ def check_weights(path: Path, weights: Mapping[str, np.ndarray], shapes: Mapping
     Raises:
         PolicyError: weights are missing, unknown, or of another shape or type; one line.
     """
-    expected = {f"{name}/{kind}/{leaf}": shape for name in shapes for kind in KINDS for leaf, shape in shapes[name].items()}
+    expected = {
+        f"{name}/{kind}/{leaf}": shape for name in shapes for kind in KINDS for leaf, shape in shapes[name].items()
+    }
     for key, leaf in weights.items():
         name, _, _ = key.partition("/")
         if key not in expected or leaf.shape != expected[key]:

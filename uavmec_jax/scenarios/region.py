@@ -86,8 +86,8 @@ def _unwrapped_corners(corners: Float[np.ndarray, "m 2"], middle: float) -> Floa
     if outside.any():
         number = int(np.argmax(outside))
         raise ValueError(
-            f"region: corner {number + 1} is {corners[number].tolist()}; give [longitude, latitude] from -180 to 360 and from "
-            "-89 to 89 degrees"
+            f"region: corner {number + 1} is {corners[number].tolist()}; give [longitude, latitude] from -180 to 360 and "
+            "from -89 to 89 degrees"
         )
     return _unwrapped(corners, middle)
 

@@ -21,7 +21,6 @@ Metres = Annotated[float, Field(ge=-MAX_POSITION_M, le=MAX_POSITION_M)]
 """A coordinate, m from the origin."""
 
 
-
 def _west_of_180(longitude: float) -> float:
     return round(longitude - 360.0, 10) if longitude > 180.0 else longitude
 

@@ -24,7 +24,6 @@ from uavmec_jax.scenarios.schema import DepotSettings, Metres, label
 from uavmec_jax.scenarios.settings import ParamsSettings, check_ranges
 from uavmec_jax.studies.axes import TRAFFIC_WEIGHTS, check_axes, check_reward, expected_depots
 
-
 DQNSettings: Any = SETTINGS["dqn"]
 PQNSettings: Any = SETTINGS["pqn"]
 PPOSettings: Any = SETTINGS["ppo"]
