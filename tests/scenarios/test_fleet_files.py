@@ -168,7 +168,7 @@ uavs = st.one_of(
     st.fixed_dictionaries({}, optional={"at": st.sampled_from(["device 1", "device 2"]), "speed_m_s": numbers}),
     st.fixed_dictionaries(
         {"x_m": st.floats(0, 800), "y_m": st.floats(0, 800)},
-        optional={"signal_range_m": numbers, "flying_power_w": st.floats(0, 200)},
+        optional={"signal_range_m": numbers, "flying_power_w": st.just(0.0) | st.floats(1e-3, 200)},
     ),
 )
 positions = st.tuples(st.floats(0, 800), st.floats(0, 800))

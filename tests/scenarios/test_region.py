@@ -103,7 +103,7 @@ def test_two_regions_are_refused():
 def test_degrees_out_of_range_are_refused():
     device = {"name": "a", "lon": 9.0, "lat": 50.0, "type": "Firefly", "task": "DNN", "capacity_j": 5e4}
     with pytest.raises(
-        ScenarioError, match=r"corner 3 is \[9.5, 90.0\]; give \[longitude, latitude\] within 180 and 89"
+        ScenarioError, match=r"corner 3 is \[9.5, 90.0\]; give \[longitude, latitude\] from -180 to 360 and from -89"
     ):
         make_named_scenario({"device": [device], "region": [[9.0, 50.0], [10.0, 50.0], [9.5, 90.0]]}, "x")
 

@@ -99,7 +99,10 @@ BAD = {
         DEVICE.replace("Firefly", "x") + "active_power_w = 1.0",
         "type is 'x', which the tables do not list",
     ),
-    "capacity": (DEVICE.replace("5e4", "0"), "device 1 (a): capacity_j is 0; it should be greater than 0"),
+    "capacity": (
+        DEVICE.replace("5e4", "0"),
+        "device 1 (a): capacity_j is 0; it should be greater than or equal to 0.001",
+    ),
     "no capacity": (DEVICE.replace("capacity_j = 5e4", ""), "device 1 (a): capacity_j is missing"),
     "hop": (
         "[params]\nuav_battery_j = 10.0\n" + DEVICE,
@@ -141,8 +144,9 @@ def test_bad_scenario_is_refused_in_one_line(tmp_path, text, message):
             "capacity_j is 'abc'; it should be a valid number",
         ),
         ("name,x_m,y_m,type,task,capacity_j,power\na,1,2,Firefly,DNN,5,maybe\n", "power is 'maybe'"),
-        ("name,x_m\na,1,2,3\n", "device 1 (a): "),
-        ("", "holds 0 devices"),
+        ("name,x_m\na,1,2,3\n", "line 2 has 4 cells; there are 2 columns"),
+        ("", "is empty; its first line should name its columns"),
+        ("name,x_m,y_m,type,task,capacity_j\n", "holds 0 devices"),
     ],
 )
 def test_bad_csv_is_refused_in_one_line(tmp_path, text, message):

@@ -84,7 +84,7 @@ def test_missing_file_and_no_json_object(tmp_path):
     path = tmp_path / "now.json"
     with pytest.raises(StateError, match=r"now\.json"):
         load_state(path, HARBOUR)
-    for text, words in (("{", "is not JSON"), ("[1]", "holds list, not an object")):
+    for text, words in (("{", "not JSON"), ("[1]", "holds a list; it should hold an object")):
         path.write_text(text)
         with pytest.raises(StateError, match=words):
             load_state(path, HARBOUR)

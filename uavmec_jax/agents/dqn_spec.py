@@ -56,7 +56,7 @@ class DQNSpec:
 
     total_steps: int = 1_000_000
     """Environment steps of one agent; rounded up to whole iterations."""
-    hidden: tuple[int, ...] = field(default=(64, 64), metadata={"items": {"ge": 1, "le": 4096}})
+    hidden: tuple[int, ...] = field(default=(64, 64), metadata={"items": {"ge": 1, "le": 4096}, "max_length": 32})
     observation: str = field(default="paper", metadata={"choices": tuple(OBSERVATIONS)})
     """Input of the network: ``paper`` (batteries and ages), or ``full``, with which it is permutation-equivariant."""
     batch_size: int = field(default=16, metadata={"ge": 1, "le": 1_000_000})

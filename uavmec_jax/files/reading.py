@@ -39,6 +39,12 @@ def read_text(path: Path, error: type[UserError], encoding: str = "utf-8", *, ma
         raise error(f"{path}: cannot be read: {where}") from None
 
 
+def read_resource(resource: Any) -> str:
+    """Read a text file that ships with the package."""
+    text: str = resource.read_text(encoding="utf-8")
+    return text
+
+
 def read_bytes(path: Path, error: type[UserError], *, max_bytes: int = MAX_TEXT_BYTES) -> bytes:
     """Read a file.
 
@@ -63,6 +69,14 @@ def digest_of(path: Path, error: type[UserError]) -> str:
         while block := file.read(_BLOCK):
             digest.update(block)
     return digest.hexdigest()
+
+
+def is_file(path: Path) -> bool:
+    """Return whether there is a regular file; no text that cannot be the name of one raises anything."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
 
 
 @contextmanager

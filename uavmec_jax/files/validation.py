@@ -3,6 +3,7 @@
 import dataclasses
 import difflib
 import math
+import re
 from collections.abc import Iterable, Sequence
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
@@ -15,7 +16,29 @@ from uavmec_jax.errors import UserError
 from_array = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
 """Converts lists for fields that are tuples: TOML and JSON have arrays only, and strict models do not convert them."""
 
-Range = Annotated[tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]], from_array]
+LARGEST = 1e12
+"""Largest size of a number: far beyond any quantity in SI units, and far from overflow in float32."""
+
+SMALLEST = 1e-12
+"""Smallest size of a number that is not 0: in float32, what is much closer to 0 is 0, and divides to infinity."""
+
+LARGEST_WHOLE = 2**31 - 1
+"""Largest whole number where nothing else is said: that of int32."""
+
+
+def _check_size(value: float) -> float:
+    if LARGEST < abs(value) < math.inf:
+        raise PydanticCustomError("too_large", f"Input should be at most {LARGEST:g} in size")
+    if 0 < abs(value) < SMALLEST:
+        raise PydanticCustomError("too_small", f"Input should be 0, or at least {SMALLEST:g} in size")
+    return value
+
+
+usual_size = AfterValidator(_check_size)
+"""Checks that a number is 0, infinite where that is allowed, or of a size from :data:`SMALLEST` to :data:`LARGEST`."""
+
+_End = Annotated[float, Field(ge=0), usual_size]
+Range = Annotated[tuple[_End, _End], from_array]
 """``[low, high]``."""
 
 
@@ -34,7 +57,7 @@ PrintableName = Annotated[str, Field(min_length=1, max_length=80), AfterValidato
 _Model = TypeVar("_Model", bound=BaseModel)
 
 _BOUNDS = ("gt", "ge", "lt", "le")
-_TYPE_TAGS = ("int", "str", "float", "bool")
+_TYPE_TAG = re.compile(r"int|str|float|bool|(constrained-|tuple\[|dict\[|list\[|function-).*", re.DOTALL)
 """Parts that pydantic adds to the location of an error in a union."""
 
 
@@ -47,12 +70,13 @@ class StrictModel(BaseModel):
 def model_from_dataclasses(name: str, *declarations: type, leave_out: tuple[str, ...] = ()) -> Any:
     """Make a strict model with the fields, defaults and bounds of dataclasses.
 
-    Numbers have to be at least 0 unless their field has bounds of its own.
+    Numbers have to be at least 0 unless their field has bounds of its own, and whole ones at most :data:`LARGEST_WHOLE`.
+    Those that are not whole have a :data:`usual_size`.
 
     Args:
         name: name of the model.
         declarations: dataclasses. The metadata of a field may hold bounds (``gt``, ``ge``, ``lt``, ``le``), the allowed
-            values (``choices``), or the bounds of the integers in a tuple of any length (``items``).
+            values (``choices``), or the bounds of the integers in a tuple (``items``) and of its length (``max_length``).
         leave_out: fields that files may not set.
     """
     fields = {
@@ -72,12 +96,12 @@ def _field(field: dataclasses.Field) -> Any:
     if isinstance(default, bool):
         return bool, default
     if isinstance(default, int):
-        return Annotated[int, Field(**{"ge": 0, **bounds})], default
+        return Annotated[int, Field(**{"ge": 0, "le": LARGEST_WHOLE, **bounds})], default
     if isinstance(default, float):
-        bounds = bounds or {"ge": 0}
-        return Annotated[float, Field(**bounds, allow_inf_nan=math.isinf(default))], default
-    if "items" in field.metadata:  # a tuple of any length
-        return Annotated[tuple[Annotated[int, Field(**field.metadata["items"])], ...], from_array], default
+        return Annotated[float, Field(**(bounds or {"ge": 0}), allow_inf_nan=math.isinf(default)), usual_size], default
+    if "items" in field.metadata:
+        length = Field(max_length=field.metadata.get("max_length"))
+        return Annotated[tuple[Annotated[int, Field(**field.metadata["items"])], ...], length, from_array], default
     return Range, default
 
 
@@ -117,10 +141,10 @@ def describe_error(source: str, error: pydantic.ValidationError, model: type[Bas
         model: the model that was validated.
         data: the data; if they are given, an error in a list of tables names the table.
     """
-    first = error.errors()[0]
+    first = _first_of(error)
     if first["type"] == "value_error":
         return f"{source}: {expectation(first)}"
-    location = [part for part in first["loc"] if part not in _TYPE_TAGS]
+    location = _without_tags(first)
     table, path = _split_location(location, model, data)
     subject = f"{source}: {table}{'.'.join(map(str, path))}".rstrip()
     if first["type"] == "extra_forbidden":
@@ -131,6 +155,22 @@ def describe_error(source: str, error: pydantic.ValidationError, model: type[Bas
     if first["type"] == "missing":
         return f"{subject} is missing"
     return f"{subject} is {first['input']!r}; {expectation(first)}"
+
+
+def _first_of(error: pydantic.ValidationError) -> Any:
+    """Return the first of pydantic's errors; of those about one value of a union, that which is deepest inside it.
+
+    The others say that the value should be of another type, such as a list where a table is given.
+    """
+    errors = error.errors()
+    whole = _without_tags(errors[0])
+    same = [one for one in errors if _without_tags(one)[: len(whole)] == whole]
+    return max(same, key=lambda one: len(_without_tags(one)))
+
+
+def _without_tags(error: Any) -> list[Any]:
+    """Return the location of an error without the parts that pydantic adds in a union."""
+    return [part for part in error["loc"] if not (isinstance(part, str) and _TYPE_TAG.fullmatch(part))]
 
 
 def _split_location(location: list[Any], model: type[BaseModel], data: Any) -> tuple[str, list[Any]]:

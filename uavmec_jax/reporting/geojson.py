@@ -1,4 +1,7 @@
-"""A plan on the map: GeoJSON (RFC 7946) with devices and depots as points, tours as lines, the region as a polygon."""
+"""A plan on the map: GeoJSON (RFC 7946) with devices and depots as points, tours as lines, the region as a polygon.
+
+Longitudes stay from -180 to 180; what crosses the antimeridian is cut there.
+"""
 
 import math
 from typing import Any
@@ -8,6 +11,7 @@ import numpy as np
 from uavmec_jax.env.fleet import DepotKind
 from uavmec_jax.env.rollout import Trace
 from uavmec_jax.planning.plan import Plan
+from uavmec_jax.reporting.antimeridian import line_geometry, polygon_geometry
 from uavmec_jax.reporting.tours import targets, uav_stops
 from uavmec_jax.scenarios.named_scenario import NamedScenario
 
@@ -84,8 +88,8 @@ def _line(scenario: NamedScenario, plan: Plan, name: str, tour: Trace, uav: int)
     """Return the tour of one UAV; it ends where the UAV was grounded."""
     stops = uav_stops(plan, tour, uav)
     moved = np.append(True, np.any(np.diff(stops, axis=0) != 0, axis=1))
-    path = scenario.geographic(stops[moved]).tolist()
-    path = path if len(path) > 1 else path * 2  # a line has at least two positions
+    path = scenario.geographic(stops[moved])
+    path = path if len(path) > 1 else path.repeat(2, axis=0)  # a line has at least two positions
     places = [int(place) + 1 for place in targets(tour)[:, uav] if place >= 0]
     properties: dict[str, Any] = {"tour": name}
     if plan.as_in_paper:
@@ -101,15 +105,14 @@ def _line(scenario: NamedScenario, plan: Plan, name: str, tour: Trace, uav: int)
         properties["mean_lifetime_slots"] = float(plan.lifetimes[name].mean())
     else:
         properties["mean_service_share"] = float(plan.service[name].mean())
-    return _feature("LineString", path, properties)
+    return _feature(*line_geometry(path), properties)
 
 
 def _region(scenario: NamedScenario) -> list[dict[str, Any]]:
     """Return the polygon of the region, if the file gives one; the last position repeats the first."""
     if (corners := scenario.region_corners) is None:
         return []
-    ring = scenario.geographic(corners).tolist()
-    return [_feature("Polygon", [[*ring, ring[0]]], {"region": scenario.name})]
+    return [_feature(*polygon_geometry(scenario.geographic(corners)), {"region": scenario.name})]
 
 
 def _feature(geometry: str, coordinates: list, properties: dict[str, Any]) -> dict[str, Any]:

@@ -5,12 +5,10 @@ from numbers import Integral
 from pathlib import Path
 from typing import Any
 
-import pydantic
-
 from uavmec_jax.env.fleet import MAX_UAVS, DepotKind, make_depots, make_fleet
 from uavmec_jax.env.params import Params
 from uavmec_jax.errors import ScenarioError
-from uavmec_jax.files.validation import describe_error
+from uavmec_jax.files.validation import validated
 from uavmec_jax.scenarios.named_scenario import NamedScenario, name_scenario
 from uavmec_jax.scenarios.places import on_place
 from uavmec_jax.scenarios.scenario_files import load_scenario_file
@@ -105,11 +103,9 @@ def _random_scenario(
 
 def _make_params(settings: dict[str, Any]) -> Params:
     """Return Table 1 with some parameters changed."""
+    checked = validated(ParamsSettings, settings, "--set", ScenarioError)
     try:
-        checked = ParamsSettings.model_validate(settings)
         check_ranges(checked, "")
-    except pydantic.ValidationError as error:
-        raise ScenarioError(describe_error("--set", error, ParamsSettings)) from None
     except ValueError as error:
         raise ScenarioError(f"--set: {error}") from None
     return Params(**checked.model_dump())

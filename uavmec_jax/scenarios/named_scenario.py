@@ -7,7 +7,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pydantic
 from jaxtyping import Array, Float, Key
 
 from uavmec_jax.env import hardware
@@ -15,10 +14,17 @@ from uavmec_jax.env.dynamics import State, initial_state
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.errors import ScenarioError, StateError
-from uavmec_jax.files.validation import describe_error
+from uavmec_jax.files.validation import validated
 from uavmec_jax.scenarios.hops import check_hops
 from uavmec_jax.scenarios.inventory import build_layout, check_inventory, depot_tables, uav_tables
-from uavmec_jax.scenarios.region import Positions, check_inside, find_positions, metres_per_degree, region_sides
+from uavmec_jax.scenarios.region import (
+    Positions,
+    check_inside,
+    find_positions,
+    metres_per_degree,
+    region_sides,
+    wrap_longitudes,
+)
 from uavmec_jax.scenarios.schema import ScenarioFile
 from uavmec_jax.scenarios.seeds import held_out_draws
 from uavmec_jax.scenarios.settings import ParamsSettings, check_ranges
@@ -83,14 +89,15 @@ class NamedScenario:
         return replace(self, params=replace(self.params, max_slots=slots))
 
     def geographic(self, position: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
-        """Convert positions ``[..., 2]`` in metres to longitudes and latitudes.
+        """Convert positions ``[..., 2]`` in metres to longitudes, from -180 to 180, and latitudes.
 
         Raises:
             ScenarioError: the scenario has no origin.
         """
         if self.origin is None:
             raise ScenarioError(f"{self.name}: has no place on the map; give origin = [longitude, latitude]")
-        return np.asarray(position, float) / metres_per_degree(self.origin[1]) + np.array(self.origin)
+        places = np.asarray(position, float) / metres_per_degree(self.origin[1]) + np.array(self.origin)
+        return np.stack([wrap_longitudes(np.asarray(places[..., 0])), places[..., 1]], axis=-1)
 
     def draws(self, count: int) -> Key[Array, " D"]:
         """Return ``count`` volume draws; for a random scenario they are those on which studies evaluate policies."""
@@ -126,10 +133,7 @@ def make_named_scenario(data: dict[str, Any], source: str, overrides: dict[str, 
     """
     if isinstance(data.get("params", {}), dict):
         data = data | {"params": data.get("params", {}) | (overrides or {})}
-    try:
-        file = ScenarioFile.model_validate(data)
-    except pydantic.ValidationError as error:
-        raise ScenarioError(describe_error(source, error, ScenarioFile, data)) from None
+    file = validated(ScenarioFile, data, source, ScenarioError)
     try:
         return _build(file)
     except ValueError as error:

@@ -1,13 +1,12 @@
 """Load policies by name or from files: heuristics, planners and trained agents."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +17,7 @@ from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Policy
 from uavmec_jax.errors import PolicyError
-from uavmec_jax.files.locations import reached
+from uavmec_jax.files.locations import StoreError, reached, reason_of
 from uavmec_jax.files.validation import suggest
 from uavmec_jax.planning.fleet_demand import is_alone
 from uavmec_jax.planning.fleet_rules import for_fleets
@@ -72,10 +71,8 @@ class TrainedPolicy:
             PolicyError: there are no such weights, or they are not finite.
         """
         weights = jax.tree.map(lambda leaf: jnp.asarray(leaf[index]), collection.weights_of(which, name))
-        try:
-            chex.assert_tree_all_finite(weights)
-        except AssertionError:
-            raise PolicyError(f"the {which} weights of {name} are not finite: training diverged") from None
+        if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(weights)):
+            raise PolicyError(f"the {which} weights of {name} are not finite: training diverged")
         alone = select_agent(collection, name, index, which)
         axes = alone.agents[name][0]
         algorithm, hyper = alone.algorithm(name), alone.hyper(name, axes)
@@ -204,11 +201,7 @@ def load_policy(source: str | Path, which: str = "best", **axes: Any) -> Policy:
     shipped = {Path(file.name).stem: file for file in _SHIPPED.iterdir() if file.name.endswith(".npz")}
     location = Path(str(shipped[str(source)])) if str(source) in shipped else source
     with reached(location, PolicyError) as path:
-        if path.is_dir():
-            path = path / WEIGHTS
-        elif not path.exists() and not path.suffix:
-            hint = suggest(str(source), [*shipped, *FLEET_HEURISTICS, "rollout"])
-            raise PolicyError(f"{source}: neither a file nor a policy by name; {hint}")
+        path = _weights_file(path, [*shipped, *FLEET_HEURISTICS, "rollout"])
         collection = read_policies(path)
     kinds = {key.split("/")[1] for key in collection.weights}
     if len(kinds) == 1:
@@ -218,6 +211,21 @@ def load_policy(source: str | Path, which: str = "best", **axes: Any) -> Policy:
         return TrainedPolicy.of(collection, name, index, which)
     except PolicyError as error:
         raise PolicyError(f"{path}: {error}") from None
+
+
+def _weights_file(path: Path, names: Sequence[str]) -> Path:
+    """Return the file at a path, or that of the run whose folder is there; ``names`` are the policies that have one."""
+    try:
+        if path.is_dir():
+            return path / WEIGHTS
+        if not path.exists() and not path.suffix:
+            hint = suggest(str(path), names)
+            raise PolicyError(f"{path}: neither a file nor a policy by name; {hint}")
+    except StoreError:
+        raise
+    except OSError as error:
+        raise PolicyError(f"{path}: cannot be read: {reason_of(error)}") from None
+    return path
 
 
 def draws_scenarios(directory: Path) -> bool:

@@ -9,16 +9,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from flax import traverse_util
 
 from uavmec_jax.agents.algorithm import Algorithm
 from uavmec_jax.agents.registry import ALGORITHMS
 from uavmec_jax.errors import PolicyError
-from uavmec_jax.files.archives import read_checked, write_checked
+from uavmec_jax.files.archives import MAX_USER_BYTES, read_checked, write_checked
 from uavmec_jax.planning.observation import FEATURES
+from uavmec_jax.scenarios.policy_schema import check_header, check_weights, network_shapes
 
 SCHEMA = 1
 """Version of the file format."""
@@ -123,11 +122,11 @@ def read_policies(path: Path) -> PolicyCollection:
     """Read and check a collection.
 
     Raises:
-        PolicyError: the file is missing, damaged, altered, no policy file, or from another version.
+        PolicyError: the file is missing, damaged, altered, no policy file, or from another version, or something in it is
+            not what it should be; one line.
     """
-    facts, weights = read_checked(path, SCHEMA, "a file of policies", PolicyError)
-    if missing := {"settings", "n_devices", "agents"} - set(facts):
-        raise PolicyError(f"{path}: is not a file of policies: its header has no {', '.join(sorted(missing))}")
+    facts, weights = read_checked(path, SCHEMA, "a file of policies", PolicyError, max_bytes=MAX_USER_BYTES)
+    check_header(path, facts)
     if facts.get("features", []) not in ([], [feature.name for feature in FEATURES]):
         raise PolicyError(
             f"{path}: its policies see other features of a device than those of this version; train again"
@@ -135,33 +134,9 @@ def read_policies(path: Path) -> PolicyCollection:
     collection = PolicyCollection(
         facts["settings"], facts["n_devices"], facts["agents"], weights, facts.get("drawn", {})
     )
-    _check_shapes(path, collection)
+    shapes = {name: network_shapes(collection.spec(name), len(agents)) for name, agents in collection.agents.items()}
+    check_weights(path, weights, shapes)
     return collection
-
-
-def _check_shapes(path: Path, collection: PolicyCollection) -> None:
-    """Check that the weights fit the networks that the settings describe; those of another version may differ."""
-    for name, agents in collection.agents.items():
-        try:
-            expected = {key: (len(agents), *shape) for key, shape in _network_shapes(collection, name).items()}
-        except (KeyError, TypeError, ValueError) as error:
-            raise PolicyError(f"{path}: its {name} is not one that this version knows: {error}") from None
-        for which in {key.split("/")[1] for key in collection.weights if key.startswith(f"{name}/")}:
-            prefix = f"{name}/{which}/"
-            shapes = {
-                key.removeprefix(prefix): leaf.shape
-                for key, leaf in collection.weights.items()
-                if key.startswith(prefix)
-            }
-            if shapes != expected:
-                raise PolicyError(f"{path}: its weights do not fit its {name} network of this version")
-
-
-def _network_shapes(collection: PolicyCollection, name: str) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of one agent's weights."""
-    spec = collection.spec(name)
-    weights: Any = jax.eval_shape(spec.network.init, jax.random.key(0), jnp.zeros((1, spec.obs_size)))
-    return {key: leaf.shape for key, leaf in traverse_util.flatten_dict(weights, sep="/").items()}
 
 
 def select_agent(collection: PolicyCollection, name: str, index: int, which: str) -> PolicyCollection:

@@ -54,15 +54,42 @@ def find_positions(file: ScenarioFile) -> Positions:
     placed = _placed(file)
     in_degrees = _check_coordinates(placed)
     given = np.array([[it.lon, it.lat] if in_degrees else [it.x_m, it.y_m] for *_, it in placed], float)
-    corners = None if file.region is None else _check_polygon(np.array(file.region, float).reshape(-1, 2), in_degrees)
+    corners = None if file.region is None else np.array(file.region, float).reshape(-1, 2)
     origin = file.origin
     if in_degrees:
+        middle = given[0, 0] if origin is None else origin[0]
+        given, corners = _unwrapped(given, middle), None if corners is None else _unwrapped_corners(corners, middle)
+    corners = None if corners is None else _check_polygon(corners)
+    if in_degrees:
         west, south = origin or (float(side) for side in (given if corners is None else corners).min(axis=0))
-        origin, scale = (west, south), metres_per_degree(south)
-        given = (given - origin) * scale
-        corners = None if corners is None else (corners - origin) * scale
+        origin, scale = (float(wrap_longitudes(np.array(west))), south), metres_per_degree(south)
+        given = (given - (west, south)) * scale
+        corners = None if corners is None else (corners - (west, south)) * scale
     devices, depots, starts = np.split(given, [len(file.device), len(file.device) + len(file.depot)])
     return Positions(devices, depots, _starts(file, np.concatenate([devices, depots]), iter(starts)), corners, origin)
+
+
+def wrap_longitudes(degrees: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Return longitudes from -180 to 180; those that are there already stay as they are, to the bit."""
+    return np.asarray(degrees - 360.0 * np.where(np.abs(degrees) > 180.0, np.round(degrees / 360.0), 0.0))
+
+
+def _unwrapped(places: Float[np.ndarray, "p 2"], middle: float) -> Float[np.ndarray, "p 2"]:
+    """Return longitudes and latitudes, the former within 180 degrees of one in their ``middle``, across the antimeridian."""
+    around = 360.0 * np.round((places[:, 0] - middle) / 360.0)
+    return places - np.stack([around, np.zeros_like(around)], axis=1)
+
+
+def _unwrapped_corners(corners: Float[np.ndarray, "m 2"], middle: float) -> Float[np.ndarray, "m 2"]:
+    """Check the corners of a region in degrees and return them unwrapped."""
+    outside = np.any((corners < [-180.0, -89.0]) | (corners > [360.0, 89.0]), axis=1)
+    if outside.any():
+        number = int(np.argmax(outside))
+        raise ValueError(
+            f"region: corner {number + 1} is {corners[number].tolist()}; give [longitude, latitude] from -180 to 360 and "
+            "from -89 to 89 degrees"
+        )
+    return _unwrapped(corners, middle)
 
 
 def _placed(file: ScenarioFile) -> list[tuple[str, int, Located]]:
@@ -159,17 +186,12 @@ def region_sides(positions: Positions) -> tuple[float, float]:
     return float(east), float(north)
 
 
-def _check_polygon(corners: Float[np.ndarray, "given 2"], in_degrees: bool) -> Float[np.ndarray, "m 2"]:
+def _check_polygon(corners: Float[np.ndarray, "given 2"]) -> Float[np.ndarray, "m 2"]:
     """Return the corners of a simple polygon, each of them once; the last one may repeat the first."""
     if len(corners) > 1 and np.array_equal(corners[0], corners[-1]):
         corners = corners[:-1]
     if not 3 <= len(corners) <= _MAX_CORNERS:
         raise ValueError(f"region has {len(corners)} different corners; give 3 to {_MAX_CORNERS}")
-    if in_degrees and np.any(np.abs(corners) > [180.0, 89.0]):
-        number = int(np.argmax(np.any(np.abs(corners) > [180.0, 89.0], axis=1)))
-        raise ValueError(
-            f"region: corner {number + 1} is {corners[number].tolist()}; give [longitude, latitude] within 180 and 89 degrees"
-        )
     along = np.roll(corners, -1, axis=0) - corners
     area = abs(np.sum(_cross(corners - corners[0], along))) / 2
     if area <= 1e-9 * np.sum(np.hypot(*along.T)) ** 2:

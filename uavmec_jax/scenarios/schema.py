@@ -6,13 +6,28 @@ from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
 from uavmec_jax.env.fleet import DepotKind
-from uavmec_jax.files.validation import StrictModel, from_array
+from uavmec_jax.files.validation import PrintableName, PrintableText, StrictModel, from_array, usual_size
 from uavmec_jax.scenarios.settings import ParamsSettings
 
-_Name = Annotated[str, Field(min_length=1, max_length=80)]
-_Power = Annotated[float, Field(ge=0)]
-_Positive = Annotated[float, Field(gt=0)]
-_Longitude = Annotated[float, Field(ge=-180, le=180)]
+MAX_POSITION_M = 1e7
+"""Largest size of a coordinate, m from the origin."""
+
+MIN_CAPACITY_J = 1e-3
+"""Smallest battery capacity of a device, J."""
+
+_Power = Annotated[float, Field(ge=0), usual_size]
+_Positive = Annotated[float, Field(gt=0), usual_size]
+Metres = Annotated[float, Field(ge=-MAX_POSITION_M, le=MAX_POSITION_M)]
+"""A coordinate, m from the origin."""
+
+
+def _west_of_180(longitude: float) -> float:
+    return round(longitude - 360.0, 10) if longitude > 180.0 else longitude
+
+
+_Longitude = Annotated[float, Field(ge=-180, le=360), AfterValidator(_west_of_180)]
+"""Degrees; those of 180 to 360 become those of -180 to 0."""
+
 _Latitude = Annotated[float, Field(ge=-89, le=89)]
 
 
@@ -22,22 +37,22 @@ def _whole(value: float) -> float:
     return value
 
 
-_Count = Annotated[float, Field(ge=0, allow_inf_nan=True), AfterValidator(_whole)]
-_CountFromOne = Annotated[float, Field(ge=1, allow_inf_nan=True), AfterValidator(_whole)]
+_Count = Annotated[float, Field(ge=0, allow_inf_nan=True), usual_size, AfterValidator(_whole)]
+_CountFromOne = Annotated[float, Field(ge=1, allow_inf_nan=True), usual_size, AfterValidator(_whole)]
 _Kind: Any = Literal[tuple(kind.name.lower() for kind in DepotKind)]
 
 
 class Named(StrictModel):
     """Something that may have a name."""
 
-    name: _Name | None = None
+    name: PrintableName | None = None
 
 
 class Located(Named):
     """Something with a name and a position, which is either ``x_m, y_m`` or ``lon, lat``. Units are in the names."""
 
-    x_m: float | None = None
-    y_m: float | None = None
+    x_m: Metres | None = None
+    y_m: Metres | None = None
     lon: _Longitude | None = None
     lat: _Latitude | None = None
 
@@ -45,18 +60,18 @@ class Located(Named):
 class Device(Located):
     """One device."""
 
-    name: _Name
-    type: str | None = None
+    name: PrintableName
+    type: PrintableText | None = None
     """A name in :data:`hardware.DEVICE_TYPES`; any other needs the three numbers below ``task``."""
-    task: str | None = None
+    task: PrintableText | None = None
     """A name in :data:`hardware.TASKS`."""
     standby_power_w: _Power | None = None
     active_power_w: _Power | None = None
     processing_rate_bytes_s: _Positive | None = None
-    capacity_j: _Positive
+    capacity_j: Annotated[float, Field(ge=MIN_CAPACITY_J), usual_size]
     power: bool = False
     comms: bool = False
-    priority: Annotated[float, Field(ge=0)] | None = None
+    priority: Annotated[float, Field(ge=0), usual_size] | None = None
     """Weight in measures of service; 1 if it is left out."""
 
 
@@ -81,7 +96,7 @@ class Uav(Located):
     The position is its start; without one, UAV ``v`` starts at depot ``v mod D``, or at the origin if there are no depots.
     """
 
-    at: str | None = None
+    at: PrintableText | None = None
     """Name of the device or depot where it starts."""
     speed_m_s: _Positive | None = None
     flying_power_w: _Power | None = None
@@ -93,10 +108,10 @@ class Uav(Located):
 class ScenarioFile(StrictModel):
     """Contents of a scenario file."""
 
-    name: str = ""
+    name: PrintableText = ""
     origin: Annotated[tuple[_Longitude, _Latitude] | None, from_array] = None
     """Longitude and latitude of the corner ``x_m = y_m = 0``."""
-    region: Annotated[tuple[Annotated[tuple[float, float], from_array], ...] | None, from_array] = None
+    region: Annotated[tuple[Annotated[tuple[Metres, Metres], from_array], ...] | None, from_array] = None
     """Corners of a polygon that all positions lie in, in the coordinates of the devices; it replaces ``params.region_m``."""
     params: ParamsSettings = ParamsSettings()
     device: Annotated[tuple[Device, ...], from_array] = ()

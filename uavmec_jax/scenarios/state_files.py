@@ -1,21 +1,28 @@
 """Read and write state files: the present state of a network, in JSON, checked against its scenario."""
 
-import json
 from pathlib import Path
 from typing import Annotated, Any
 
 import jax.numpy as jnp
 import numpy as np
-import pydantic
 from jaxtyping import Int, Num
 from pydantic import Field
 
 from uavmec_jax.env.dynamics import State, slots_to_expiry
 from uavmec_jax.errors import StateError
-from uavmec_jax.files.reading import read_text
-from uavmec_jax.files.validation import describe_error, from_array
+from uavmec_jax.files.parsing import read_json_object
+from uavmec_jax.files.validation import from_array, usual_size, validated
 from uavmec_jax.scenarios.named_scenario import NamedScenario
-from uavmec_jax.scenarios.uav_states import Number, UavStates, by_name, depot_packs, name_uavs, uav_arrays, uav_data
+from uavmec_jax.scenarios.uav_states import (
+    Number,
+    UavStates,
+    Whole,
+    by_name,
+    depot_packs,
+    name_uavs,
+    uav_arrays,
+    uav_data,
+)
 
 _MAX_SLOTS = 1_000_000
 
@@ -28,14 +35,14 @@ class StateFile(UavStates):
 
     battery_j: Annotated[tuple[Number, ...] | dict[str, Number] | None, from_array] = None
     """Energy left in each device, J."""
-    age_slots: Annotated[tuple[int, ...] | dict[str, int] | None, from_array] = None
+    age_slots: Annotated[tuple[Whole, ...] | dict[str, Whole] | None, from_array] = None
     """Slots since each device's data were last delivered."""
-    failed_at: Annotated[tuple[int, ...] | dict[str, int] | None, from_array] = None
+    failed_at: Annotated[tuple[Whole, ...] | dict[str, Whole] | None, from_array] = None
     """Number of slots that were completed when each battery ran out, -1 for devices that work; only if ``params.end`` is
     ``horizon``."""
     slot: Annotated[int, Field(ge=0, le=_MAX_SLOTS)] = 0
     """Number of completed slots."""
-    elapsed_s: Annotated[float, Field(ge=0)] = 0.0
+    elapsed_s: Annotated[float, Field(ge=0), usual_size] = 0.0
     """Duration of the completed slots, s."""
 
 
@@ -46,14 +53,7 @@ def load_state(path: str | Path, scenario: NamedScenario) -> State:
         StateError: the file is missing, or a value in it does not fit the scenario; one line.
     """
     path = Path(path)
-    text = read_text(path, StateError)
-    try:
-        data = json.loads(text)
-    except ValueError as error:
-        raise StateError(f"{path}: is not JSON: {error}") from None
-    if not isinstance(data, dict):
-        raise StateError(f'{path}: holds {type(data).__name__}, not an object; give e.g. {{"age_slots": [0, 3, 1]}}')
-    return make_state(data, scenario, str(path))
+    return make_state(read_json_object(path, StateError), scenario, str(path))
 
 
 def make_state(data: dict[str, Any], scenario: NamedScenario, source: str) -> State:
@@ -68,10 +68,9 @@ def make_state(data: dict[str, Any], scenario: NamedScenario, source: str) -> St
         StateError: a value does not fit the scenario; one line that names it.
     """
     try:
-        file = StateFile.model_validate(name_uavs(data, scenario))
-        return _build(file, scenario)
-    except pydantic.ValidationError as error:
-        raise StateError(describe_error(source, error, StateFile)) from None
+        return _build(validated(StateFile, name_uavs(data, scenario), source, StateError), scenario)
+    except StateError:
+        raise
     except ValueError as error:
         raise StateError(f"{source}: {error}") from None
 

@@ -9,13 +9,17 @@ from pydantic import Field
 
 from uavmec_jax.env.fleet import DepotKind
 from uavmec_jax.env.layout import fleet_of
-from uavmec_jax.files.validation import StrictModel, from_array
+from uavmec_jax.files.validation import LARGEST_WHOLE, StrictModel, from_array
 from uavmec_jax.scenarios.inventory import place_at
 from uavmec_jax.scenarios.named_scenario import NamedScenario
 from uavmec_jax.scenarios.schema import label
 
 Number = Annotated[float, Field(allow_inf_nan=True)]
 """A number whose range is checked in a message that names the device or UAV."""
+
+
+Whole = Annotated[int, Field(ge=-LARGEST_WHOLE, le=LARGEST_WHOLE)]
+"""A whole number whose range is checked in a message that names the device."""
 
 
 class UavState(StrictModel):

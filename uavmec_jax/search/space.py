@@ -14,8 +14,8 @@ from uavmec_jax.agents.registry import ALGORITHMS
 from uavmec_jax.env.rewards import REWARDS, TERMS
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files.parsing import parse_toml
-from uavmec_jax.files.reading import read_text
-from uavmec_jax.files.validation import StrictModel, describe_error, expectation, from_array, suggest
+from uavmec_jax.files.reading import is_file, read_resource, read_text
+from uavmec_jax.files.validation import StrictModel, expectation, from_array, suggest, validated
 from uavmec_jax.studies.axes import MAX_WEIGHT
 from uavmec_jax.studies.population import seeds_of
 from uavmec_jax.studies.schema import Study
@@ -125,17 +125,14 @@ def load_space(name_or_path: str, overrides: Mapping[str, Any] | None = None) ->
     """
     library = shipped_spaces()
     if name_or_path in library:
-        text = library[name_or_path].read_text(encoding="utf-8")
-    elif not Path(name_or_path).is_file():
+        text = read_resource(library[name_or_path])
+    elif not is_file(Path(name_or_path)):
         hint = suggest(Path(name_or_path).stem, library)
         raise StudyError(f"{name_or_path}: neither a file of a search space nor a shipped one; {hint}")
     else:
         text = read_text(Path(name_or_path), StudyError)
     data = {"name": Path(name_or_path).stem} | parse_toml(text, name_or_path, StudyError) | dict(overrides or {})
-    try:
-        space = Space.model_validate(data)
-    except pydantic.ValidationError as error:
-        raise StudyError(describe_error(name_or_path, error, Space)) from None
+    space = validated(Space, data, name_or_path, StudyError)
     _check(name_or_path, space)
     return space
 

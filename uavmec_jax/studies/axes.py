@@ -140,7 +140,10 @@ def _expected(study: Any, name: str, value: Any) -> str:
         case "guard":
             fits, expected = value in LOG_GUARDS, suggest(str(value), LOG_GUARDS)
         case "place":
-            fits, expected = isinstance(value, str) and value != "", "give names of places or paths of their files"
+            fits, expected = (
+                isinstance(value, str) and value.isprintable() and value != "",
+                "give names of places or paths of their files",
+            )
         case "traffic_bonus" | "traffic_penalty":
             fits, expected = is_number and 0 <= value <= MAX_WEIGHT, f"give numbers from 0 to {MAX_WEIGHT:g}"
         case _:

@@ -1,7 +1,7 @@
 """The schema of study files.
 
-The numbers of Table 1 and the hyperparameters are declared once (:class:`Params`, :data:`ALGORITHMS`); their models here are
-made from those declarations.
+The numbers of Table 1 and the hyperparameters are declared once (:class:`Params`, :data:`ALGORITHMS`); their models
+(:data:`SETTINGS`, :class:`ParamsSettings`) are made from those declarations.
 """
 
 from collections.abc import Sequence
@@ -10,32 +10,24 @@ from typing import Annotated, Any, Literal, get_args
 import pydantic
 from pydantic import Field
 
-from uavmec_jax.agents.registry import ALGORITHMS, MAX_STEPS, SCENARIO_SETTINGS, check_end
+from uavmec_jax.agents.registry import ALGORITHMS, MAX_STEPS, check_end
+from uavmec_jax.agents.settings import SETTINGS
 from uavmec_jax.env.fleet import MAX_UAVS
 from uavmec_jax.env.rewards import DEFAULT_REWARD, LOG_GUARDS
-from uavmec_jax.files.validation import StrictModel, from_array, model_from_dataclasses
+from uavmec_jax.files.validation import PrintableText, StrictModel, from_array
 from uavmec_jax.planning.beam import WIDTH as BEAM_WIDTH
 from uavmec_jax.planning.heuristics import FLEET_HEURISTICS, HEURISTICS
 from uavmec_jax.planning.rollout_planner import SAMPLES as ROLLOUT_SAMPLES
 from uavmec_jax.scenarios.distribution import ScenarioSettings, check_scenarios
 from uavmec_jax.scenarios.inventory import check_depots
-from uavmec_jax.scenarios.schema import DepotSettings, label
+from uavmec_jax.scenarios.schema import DepotSettings, Metres, label
 from uavmec_jax.scenarios.settings import ParamsSettings, check_ranges
 from uavmec_jax.studies.axes import MAX_WEIGHT, TRAFFIC_WEIGHTS, check_axes, check_reward, expected_depots
 
-
-def _algorithm_settings(name: str) -> Any:
-    """Make the model of an algorithm's settings, traced and static."""
-    registered = ALGORITHMS[name]
-    return model_from_dataclasses(
-        f"{name.upper()}Settings", registered.hyper, registered.spec, leave_out=SCENARIO_SETTINGS
-    )
-
-
-DQNSettings: Any = _algorithm_settings("dqn")
-PQNSettings: Any = _algorithm_settings("pqn")
-PPOSettings: Any = _algorithm_settings("ppo")
-A2CSettings: Any = _algorithm_settings("a2c")
+DQNSettings: Any = SETTINGS["dqn"]
+PQNSettings: Any = SETTINGS["pqn"]
+PPOSettings: Any = SETTINGS["ppo"]
+A2CSettings: Any = SETTINGS["a2c"]
 
 AlgorithmName: Any = Literal[(*ALGORITHMS, "none")]
 Guard: Any = Literal[LOG_GUARDS]
@@ -88,22 +80,22 @@ class Evaluation(StrictModel):
 class StudyDepot(DepotSettings):
     """One depot of a study."""
 
-    x_m: float
-    y_m: float
+    x_m: Metres
+    y_m: Metres
 
 
 class Study(StrictModel):
     """A study; its population is the product of its axes."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=80)] = "study"
-    description: str = ""
+    description: Annotated[str, Field(max_length=10_000)] = ""
     algorithm: AlgorithmName = "dqn"
     """``none`` trains nothing and evaluates heuristics and planners only. Several algorithms are an axis."""
     reward: str | dict[str, float] = DEFAULT_REWARD
     guard: Guard = "clamp"
     steps: Annotated[int, Field(ge=1, le=MAX_STEPS)] = 1_000_000
     """Environment steps of one agent."""
-    place: str = ""
+    place: PrintableText = ""
     """A place whose evacuation was simulated, by name or file; if empty, positions are random and traffic is unknown."""
     place_scale_m: Annotated[float, Field(ge=1, le=1e7)] | None = None
     """Length to which the longer side of a place is scaled (800 in the paper); by default distances are real."""

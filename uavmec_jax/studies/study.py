@@ -5,14 +5,13 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import pydantic
 import tomli_w
 
 from uavmec_jax.agents.registry import ALGORITHMS
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files.parsing import parse_toml
-from uavmec_jax.files.reading import read_text
-from uavmec_jax.files.validation import describe_error, suggest
+from uavmec_jax.files.reading import is_file, read_resource, read_text
+from uavmec_jax.files.validation import suggest, validated
 from uavmec_jax.scenarios.settings import unused_params
 from uavmec_jax.studies.schema import Study
 
@@ -36,11 +35,11 @@ def load_study(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
     """
     library = shipped_studies()
     if str(name_or_path) in library:
-        source, text = str(name_or_path), library[str(name_or_path)].read_text(encoding="utf-8")
+        source, text = str(name_or_path), read_resource(library[str(name_or_path)])
     else:
         path = Path(name_or_path)
         source = str(path)
-        if not path.is_file():
+        if not is_file(path):
             hint = suggest(path.stem, library) if path.suffix != ".toml" else "no such file"
             raise StudyError(f"{source}: neither a study file nor a shipped study; {hint}")
         text = read_text(path, StudyError)
@@ -68,10 +67,7 @@ def parse_study(text: str, source: str, overrides: Mapping[str, Any] | None = No
                 raise StudyError(f"{source}: {dotted} cannot be set: {parent} is not a table")
         table[last] = value
     data.setdefault("name", Path(source).stem)
-    try:
-        return Study.model_validate(data)
-    except pydantic.ValidationError as error:
-        raise StudyError(describe_error(source, error, Study, data)) from None
+    return validated(Study, data, source, StudyError)
 
 
 def study_toml(study: Study) -> str:
