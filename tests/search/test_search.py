@@ -144,7 +144,7 @@ def test_the_shipped_space():
             "validation.first_seed is 1: the study reports the scenarios of seed 1",
         ),
         ("[[12, 8]]", "[[13, 8]]", "validation.cells has [13, 8]; give counts from 0 to 12"),
-        ("rungs = [0.3]", "rungs = [1.5]", "halving.rungs.0 is 1.5; it should be less than 1"),
+        ("rungs = [0.3]", "rungs = [1.5]", "halving.rungs: item 1 is 1.5; it should be less than 1"),
         ('"tiny.toml"', '"table6"', "study 'table6' trains 3 algorithms; search one"),
         ('"tiny.toml"', '"none.toml"', "none.toml: neither a study file nor a shipped study"),
         ("trials = 8", "trails = 8", "space.toml: trails is not a setting; did you mean 'trials'?"),
