@@ -24,13 +24,14 @@ class Engine(StrictModel):
 
 
 class Seat(StrictModel):
-    name: str
+    name: Annotated[str, Field(min_length=1)]
     width_m: Annotated[float, Field(gt=0, le=2)] = 0.5
 
 
 class Cabin(StrictModel):
     seat: Annotated[tuple[Seat, ...], from_array] = ()
     lamps: Annotated[tuple[str, ...], from_array] = ()
+    bags: Annotated[tuple[int, ...], Field(min_length=2), from_array] = (1, 2)
 
 
 class Car(StrictModel):
@@ -110,6 +111,11 @@ ERRORS = {
         {"wheels": 4, "cabin": {"lamps": ["a", 3]}},
         "car.toml: cabin.lamps: item 2 is 3; it should",
     ),
+    "empty text": (
+        {"wheels": 4, "seat": [{"name": ""}]},
+        "car.toml: seat 1 (): name is ''; it should have at least 1 char",
+    ),
+    "too few": ({"wheels": 4, "cabin": {"bags": [1]}}, "cabin.bags is (1,); it should have at least 2 items, not 1"),
     "no table in a list of tables": ({"wheels": 4, "seat": [3]}, "car.toml: seat 1 (3): is 3; it should be"),
     "validator": ({"wheels": 4, "seat": [{"name": "a"}] * 4}, "car.toml: holds more than 3 seats"),
     "no table": ([1], "car.toml: is [1]; it should be a valid dictionary"),

@@ -3,6 +3,7 @@
 import dataclasses
 import difflib
 import math
+import re
 from collections.abc import Iterable, Sequence
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
@@ -36,6 +37,9 @@ _Model = TypeVar("_Model", bound=BaseModel)
 _BOUNDS = ("gt", "ge", "lt", "le")
 _TYPE_TAGS = ("int", "str", "float", "bool")
 """Parts that pydantic adds to the location of an error in a union."""
+
+_SUBJECT = re.compile(r"\b(Input|String|Tuple|List|Dictionary) should")
+"""What pydantic calls a value that should be something else."""
 
 
 class StrictModel(BaseModel):
@@ -104,8 +108,8 @@ def suggest(word: str, options: Iterable[str]) -> str:
 
 def expectation(error: Any) -> str:
     """Return what one of pydantic's errors says that the value should be."""
-    message: str = error["msg"]
-    return message.replace("Input should be", "it should be").replace("Value error, ", "")
+    message = _SUBJECT.sub("it should", error["msg"], count=1)
+    return message.replace(" after validation", "").replace("Value error, ", "")
 
 
 def describe_error(source: str, error: pydantic.ValidationError, model: type[BaseModel], data: Any = None) -> str:

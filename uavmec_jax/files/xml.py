@@ -21,7 +21,7 @@ MAX_BYTES = 4 * 2**30
 MAX_EXPANSION = 60
 """Most bytes that a compressed byte may become, once ``FREE_BYTES`` are exceeded; maps reach 10 to 25."""
 
-FREE_BYTES = 16 * 2**20
+FREE_BYTES = 4 * 2**20
 
 MAX_DEPTH = 40
 """Deepest nesting of elements."""
