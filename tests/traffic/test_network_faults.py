@@ -44,7 +44,7 @@ PLAIN = {
     "edge from nowhere": ({"edges": EDGES.replace('from="a"', "")}, "The from-node is not given for edge 'ab'"),
     "unknown type": ({"edges": EDGES.replace('"r"', '"q"')}, "Type 'q' used by edge 'ab' was not defined"),
     "no position": ({"nodes": NODES.replace('x="0"', "")}, "Missing position (at node ID='a')"),
-    "no nodes": ({"nodes": "<nodes/>"}, "No nodes loaded"),
+    "no nodes": ({"nodes": "<nodes/>"}, "Edge's 'ab' from-node 'a' is not known"),
     "no edges": ({"edges": "<edges/>"}, ""),
     "id with a space": ({"nodes": NODES.replace('"a"', '"a a"')}, "Invalid node id 'a a'"),
 }

@@ -194,7 +194,7 @@ def test_an_extract_without_roads_is_one_line(tmp_path):
     assert "park.osm: netconvert: " in done.stderr
 
 
-def test_sumos_last_error_is_reported(folder, monkeypatch):
+def test_sumos_first_error_is_reported(folder, monkeypatch):
     monkeypatch.setattr(
         "uavmec_jax.traffic.simulation.write_trips", lambda path, *_: path.write_text("<routes><trip") or 1
     )
