@@ -24,8 +24,14 @@ class Engine(StrictModel):
 
 
 class Seat(StrictModel):
-    name: str
+    name: Annotated[str, Field(min_length=1)]
     width_m: Annotated[float, Field(gt=0, le=2)] = 0.5
+
+
+class Cabin(StrictModel):
+    seat: Annotated[tuple[Seat, ...], from_array] = ()
+    lamps: Annotated[tuple[str, ...], from_array] = ()
+    bags: Annotated[tuple[int, ...], Field(min_length=2), from_array] = (1, 2)
 
 
 class Car(StrictModel):
@@ -36,6 +42,8 @@ class Car(StrictModel):
     origin: Annotated[tuple[float, Annotated[float, Field(le=90)]] | None, from_array] = None
     seat: Annotated[tuple[Seat, ...], from_array] = ()
     doors: dict[str, Seat] = Field(default_factory=dict)
+    routes: Annotated[tuple[Annotated[tuple[float, ...], from_array], ...], from_array] = ()
+    cabin: Cabin = Cabin()
 
     @pydantic.model_validator(mode="after")
     def _check_seats(self):
@@ -53,7 +61,7 @@ ERRORS = {
     "key": ({"wheels": 4, "engin": {}}, "car.toml: engin is not a setting; did you mean 'engine'?"),
     "unlike key": (
         {"wheels": 4, "q": 1},
-        "car.toml: q is not a setting; known: wheels, mirrors, engine, spare_engine, origin, seat, doors",
+        "car.toml: q is not a setting; known: wheels, mirrors, engine, spare_engine, origin, seat, doors, routes, cabin",
     ),
     "nested key": (
         {"wheels": 4, "engine": {"powr_w": 1.0}},
@@ -69,7 +77,7 @@ ERRORS = {
     ),
     "value in an array": (
         {"wheels": 4, "origin": [9.0, 95.0]},
-        "car.toml: origin.1 is 95.0; it should be less than or equal to 90",
+        "car.toml: origin: item 2 is 95.0; it should be less than or equal to 90",
     ),
     "value in a list of tables": (
         {"wheels": 4, "seat": [{"name": "left"}, {"name": "right", "width_m": 3.0}]},
@@ -91,6 +99,23 @@ ERRORS = {
         {"wheels": 4, "doors": {"left": {"name": "a", "width": 3.0}}},
         "car.toml: doors.left.width is not a setting; did you mean 'width_m'? known: name, width_m",
     ),
+    "item of a list in a list": (
+        {"wheels": 4, "routes": [[1.0, 2.0], [1.0, math.nan]]},
+        "car.toml: routes: item 2: item 2 is nan; it should be a finite number",
+    ),
+    "table of a list inside a table": (
+        {"wheels": 4, "cabin": {"seat": [{"name": "a"}, {"name": "b", "width": 1.0}]}},
+        "car.toml: cabin.seat 2 (b): width is not a setting; did you mean 'width_m'? known: name, width_m",
+    ),
+    "item inside a table": (
+        {"wheels": 4, "cabin": {"lamps": ["a", 3]}},
+        "car.toml: cabin.lamps: item 2 is 3; it should",
+    ),
+    "empty text": (
+        {"wheels": 4, "seat": [{"name": ""}]},
+        "car.toml: seat 1 (): name is ''; it should have at least 1 char",
+    ),
+    "too few": ({"wheels": 4, "cabin": {"bags": [1]}}, "cabin.bags is (1,); it should have at least 2 items, not 1"),
     "no table in a list of tables": ({"wheels": 4, "seat": [3]}, "car.toml: seat 1 (3): is 3; it should be"),
     "validator": ({"wheels": 4, "seat": [{"name": "a"}] * 4}, "car.toml: holds more than 3 seats"),
     "no table": ([1], "car.toml: is [1]; it should be a valid dictionary"),
@@ -107,10 +132,10 @@ def test_an_error_is_one_line_that_says_what_would_be_right(data, message):
     assert "\n" not in description
 
 
-def test_without_the_data_a_list_of_tables_has_its_path():
+def test_without_the_data_a_table_of_a_list_has_its_number():
     with pytest.raises(pydantic.ValidationError) as error:
         Car.model_validate({"wheels": 4, "seat": [{"name": "left", "width_m": 3.0}]})
-    assert describe_error("x", error.value, Car) == "x: seat.0.width_m is 3.0; it should be less than or equal to 2"
+    assert describe_error("x", error.value, Car) == "x: seat 1: width_m is 3.0; it should be less than or equal to 2"
     assert expectation(error.value.errors()[0]) == "it should be less than or equal to 2"
 
 
@@ -168,10 +193,10 @@ def test_a_model_has_the_fields_and_defaults_of_its_dataclasses():
         ({"laps": 10}, "laps is 10; it should be less than or equal to 9"),
         ({"laps": -1}, "laps is -1; it should be greater than or equal to 0"),
         ({"laps": True}, "laps is True; it should be a valid integer"),
-        ({"range_m": [-1.0, 2.0]}, "range_m.0 is -1.0; it should be greater than or equal to 0"),
+        ({"range_m": [-1.0, 2.0]}, "range_m: item 1 is -1.0; it should be greater than or equal to 0"),
         ({"forward": 1}, "forward is 1; it should be a valid boolean"),
         ({"colour": "green"}, "colour is 'green'; it should be 'red' or 'blue'"),
-        ({"ages": [20, 17]}, "ages.1 is 17; it should be greater than or equal to 18"),
+        ({"ages": [20, 17]}, "ages: item 2 is 17; it should be greater than or equal to 18"),
         ({"secret": 1}, "secret is not a setting; did you mean 'speed'?"),
     ],
 )

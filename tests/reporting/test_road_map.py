@@ -1,11 +1,14 @@
 """Road maps and animations."""
 
+from io import StringIO
+
 import jax
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgba
 from numpy.testing import assert_allclose
 from PIL import Image
+from rich.console import Console
 
 from tests.traffic.networks import evacuation
 from uavmec_jax.env.fleet import make_fleet
@@ -13,8 +16,8 @@ from uavmec_jax.env.layout import sample_layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.planning.heuristics import HEURISTICS
 from uavmec_jax.reporting.animation import save_animation
-from uavmec_jax.reporting.canvas import new_figure, save
-from uavmec_jax.reporting.evacuation import evacuation_data, evacuation_lines
+from uavmec_jax.reporting.canvas import literal, new_figure, save
+from uavmec_jax.reporting.evacuation import evacuation_data, evacuation_lines, evacuation_table
 from uavmec_jax.reporting.road_map import COLOURS, LIMITS, colours_of, draw_roads, map_figure
 from uavmec_jax.scenarios.places import on_place
 from uavmec_jax.traffic.evacuation import load_evacuation
@@ -39,6 +42,26 @@ def test_map_of_a_shipped_place(tmp_path):
     assert {str(number) for number in range(1, 13)} <= texts
     save(figure, tmp_path / "map.png")
     assert (tmp_path / "map.png").stat().st_size > 20_000
+
+
+def test_dollars_and_brackets_of_a_description_are_drawn_and_printed_as_they_are(tmp_path):
+    text = r"costs $x^{$ and $\frac$ [/bold] [link=https://x.y]:smile:"
+    place = evacuation()
+    place.meta.update(description=text, names=["[red]a[/red]", "[/]", "[bold"])
+    figure = map_figure(place)
+    assert figure.get_supxlabel() == text.replace("$", r"\$")
+    save(figure, tmp_path / "map.svg")  # a formula would be a ValueError, a part of one a line of paths
+    console = Console(record=True, width=200, file=StringIO())
+    console.print(evacuation_table(place))
+    printed = console.export_text()
+    assert all(name in printed for name in place.meta["names"])
+
+
+def test_literal_text_is_what_matplotlib_draws():
+    canvas = new_figure(1, 1)
+    for text in ("$", "$$", "$a$ $", r"\$5\$", r"a\b$c", ""):
+        drawn, is_formula = canvas.text(0, 0, literal(text))._preprocess_math(literal(text))
+        assert (drawn, is_formula) == (text, False)
 
 
 def test_lines_and_data():

@@ -82,8 +82,11 @@ BAD = {
         "the sides from corners 1 and 3 meet",
     ),
     "negative": ([[-5.0, 0.0], [600.0, 0.0], [600.0, 500.0]], "region: corner 1 lies at -5, 0 m; give corners north"),
-    "not finite": ([[math.nan, 0.0], [600.0, 0.0], [600.0, 500.0]], "region.0.0 is nan; it should be a finite number"),
-    "one number": ([[0.0], [600.0, 0.0], [600.0, 500.0]], "region.0.1 is missing"),
+    "not finite": (
+        [[math.nan, 0.0], [600.0, 0.0], [600.0, 500.0]],
+        "region: item 1: item 1 is nan; it should be a finite number",
+    ),
+    "one number": ([[0.0], [600.0, 0.0], [600.0, 500.0]], "region: item 1: item 2 is missing"),
 }
 
 

@@ -121,7 +121,7 @@ BAD = {
         "[params]\ntask_volume_range_bytes = [4e6, 2e6]\n" + DEVICE,
         "params.task_volume_range_bytes is [4000000.0, 2",
     ),
-    "origin": ("origin = [9.9, 95.0]\n" + DEVICE, "origin.1 is 95.0; it should be less than or equal to 89"),
+    "origin": ("origin = [9.9, 95.0]\n" + DEVICE, "origin: item 2 is 95.0; it should be less than or equal to 89"),
     "toml": ("[[device]", "not TOML"),
     "table": ("device = [3]", "device 1 (3): "),
 }

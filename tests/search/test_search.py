@@ -164,7 +164,7 @@ def test_the_shipped_space():
         ),
         ("low = 0.0, high = 1.0", "choices = [1.0, nan]", "space.reward.M has nan; give numbers from -1e+09 to 1e+09"),
         (SPACE[SPACE.index("learning_rate") :], "", "space.toml: space is empty; give at least one setting to search"),
-        ("rungs = [0.3]", "rungs = [1.5]", "halving.rungs.0 is 1.5; it should be less than 1"),
+        ("rungs = [0.3]", "rungs = [1.5]", "halving.rungs: item 1 is 1.5; it should be less than 1"),
         ('"tiny.toml"', '"table6"', "study 'table6' trains 3 algorithms; search one"),
         ('"tiny.toml"', '"none.toml"', "none.toml: neither a study file nor a shipped study"),
         ("trials = 8", "trails = 8", "space.toml: trails is not a setting; did you mean 'trials'?"),

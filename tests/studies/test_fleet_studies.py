@@ -170,7 +170,10 @@ BAD = [
         {"evaluation.clairvoyant_seeds": []},
         "bad.toml: evaluation.clairvoyant_seeds is empty; give a number for one UAV",
     ),
-    ({"evaluation.clairvoyant_seeds": [-1]}, "bad.toml: evaluation.clairvoyant_seeds.0 is -1; it should be greater"),
+    (
+        {"evaluation.clairvoyant_seeds": [-1]},
+        "bad.toml: evaluation.clairvoyant_seeds: item 1 is -1; it should be greater",
+    ),
     ({"reward": {"X": 1.0}}, "bad.toml: reward has the term 'X', which is not one; known: A, U, M, O, log A"),
     (
         {"params.end": "horizon", "evaluation.planners": ["rollout", "bound"]},

@@ -179,7 +179,7 @@ BAD = [
     ({"axes.cells": [[8, 8]]}, "bad.toml: axes.cells is given, and axes.powered or axes.connected too; give"),
     (
         {"evaluation.planners": ["oracle"]},
-        "bad.toml: evaluation.planners.0 is 'oracle'; it should be 'rollout', 'beam'",
+        "bad.toml: evaluation.planners: item 1 is 'oracle'; it should be 'rollout', 'beam'",
     ),
     (
         {"algorithm": "none", "evaluation.baselines": [], "evaluation.planners": []},

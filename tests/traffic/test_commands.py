@@ -1,12 +1,14 @@
 """`uavmec traffic`: its output, and one line for bad input. No test here starts SUMO."""
 
 import json
+import os
 import subprocess
 import sys
 
 import pytest
 from click.testing import CliRunner
 
+from tests.deadlines import within
 from tests.traffic.networks import osm_extract
 from uavmec_jax.cli import main
 from uavmec_jax.traffic import sumo
@@ -62,6 +64,23 @@ BAD = [
     (["build", "--osm", "x.osm", "--set", "vehicles=3"], "--set vehicles: name a table and a setting, e.g. demand.ve"),
     (["build", "--osm", "x.osm", "--set", "demand.cars=3"], "x.osm: demand.cars is not a setting"),
     (["build", "--osm", "x.osm", "--devices", "empty.toml"], "empty.toml: holds no [[device]] tables"),
+    (
+        ["build", "albany", "--devices", "cams.toml"],
+        "cams.toml: device 1 (north camera): gives lon and lat; degrees are not read here, give x_m and y_m in the "
+        "metres of the network, or junction (known: name, junction, x_m, y_m)",
+    ),
+    (
+        ["build", "albany", "--devices", "typo.toml"],
+        "typo.toml: device 1 (north camera): junction_id is not a setting; did you mean 'junction'? known: name, junction,",
+    ),
+    (["build", "albany", "--devices", "other.toml"], "other.toml: demand is not a setting; known: device"),
+    (
+        ["build", "albany", "--devices", "unclear.toml"],
+        "unclear.toml: device 2 (south): place is unclear; give junction",
+    ),
+    (["build", "albany", "--devices", "one.toml"], "one.toml: holds 1 [[device]] tables; give 2 to 1000, or none"),
+    (["build", "albany", "--out", "folder.npz"], "--out folder.npz: is not a regular file, and is not replaced"),
+    (["build", "albany", "--out", "n" * 300 + "/x.npz"], "--out nnn"),
     (["build", "--osm", "x.osm", "--devices", "none.toml"], "none.toml: cannot be read: No such file"),
     (["build", "albania"], "albania: neither a file nor a shipped place"),
     (["build", "x.sumocfg"], "x.sumocfg: not TOML"),
@@ -69,6 +88,10 @@ BAD = [
     (["build", "--osm", "x.sumocfg"], "x.sumocfg: is a SUMO configuration, which is never run; give an OpenStreetMap"),
     (["build", "--osm", "broken.osm"], "broken.osm: is not XML, or is truncated"),
 ]
+
+
+NORTH, SOUTH = '[[device]]\nname = "north camera"\n', '[[device]]\nname = "south"\n'
+JUNCTION = 'junction = "state_swan"\n'
 
 
 @pytest.mark.parametrize(
@@ -79,17 +102,37 @@ def test_bad_input_is_one_line_and_exit_code_2(tmp_path, monkeypatch, arguments,
         "x.osm": osm_extract(),
         "broken.osm": osm_extract()[:500],
         "empty.toml": "",
+        "cams.toml": NORTH + "lon = -73.755\nlat = 42.652\n" + SOUTH + "lon = -73.752\nlat = 42.648\n",
+        "typo.toml": '[[device]]\njunction_id = "x"\nname = "north camera"\n' + SOUTH,
+        "other.toml": NORTH + JUNCTION + SOUTH + JUNCTION + "[demand]\nvehicles = 3\n",
+        "unclear.toml": NORTH + JUNCTION + SOUTH + "x_m = 3.0\n",
+        "one.toml": NORTH + JUNCTION,
         "x.sumocfg": "<configuration><output><summary-output value='evil.xml'/></output></configuration>",
     }
     for name, text in files.items():
         (tmp_path / name).write_text(text)
+    (tmp_path / "folder.npz").mkdir()
     monkeypatch.chdir(tmp_path)
     done = uavmec("traffic", *arguments)
     assert done.exit_code == 2, done.output
     message = done.stderr.removeprefix("uavmec: ").removeprefix(f"{tmp_path}/")
     assert message.startswith(line)
     assert done.stderr.count("\n") == 1
-    assert {file.name for file in tmp_path.iterdir()} == set(files)  # nothing was written
+    assert {file.name for file in tmp_path.iterdir()} == {*files, "folder.npz"}  # nothing was written
+
+
+@pytest.mark.parametrize("option", ["--osm", "--net", "--devices", "PLACE"])
+def test_a_fifo_or_a_device_file_is_refused_at_once(tmp_path, monkeypatch, option):
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("pipe.toml")
+    for path in ("pipe.toml", "/dev/zero"):
+        given = [path] if option == "PLACE" else [option, path] + ["albany"] * (option == "--devices")
+        with within(20):  # the imports among them
+            done = uavmec("traffic", "build", *given)
+        assert done.exit_code == 2, done.output
+        assert done.stderr.endswith(f"{path}: cannot be read: is not a regular file\n")
+        assert done.stderr.count("\n") == 1
+    assert [file.name for file in tmp_path.iterdir()] == ["pipe.toml"]
 
 
 def test_without_sumo_one_line_says_how_to_get_it(tmp_path, monkeypatch):

@@ -104,6 +104,16 @@ def test_devices_are_named_after_their_streets():
     assert _junction_names(["a", "b"], named) == ["High Street (a)", "High Street (b)"]
 
 
+def test_names_of_devices_can_be_printed_differ_and_are_as_long_as_names_may_be():
+    junctions = {"a": (0, 0), "b": (100, 0), "c" * 200: (200, 0), "d" * 200: (300, 0), "e": (400, 0)}
+    streets = {("a", "b"): "Ring\u00a0Road\u200b\x1b", ("c" * 200, "d" * 200): "", ("d" * 200, "e"): "x" * 300}
+    roads = [road(*pair, "residential", junctions, name=name) for pair, name in streets.items()]
+    names = _junction_names(list(junctions), network(roads, {}, junctions))
+    assert names[:2] == ["Ring Road (a)", "Ring Road (b)"]
+    assert len(set(names)) == 5
+    assert all(name.isprintable() and len(name) <= 80 for name in names)
+
+
 def test_more_devices_than_junctions():
     with pytest.raises(
         TrafficError, match=r"g: 30 devices, but 25 junctions in the 900 m around where people live \(26 in"
@@ -122,6 +132,6 @@ def test_sites_of_a_file():
     sites[0]["junction"] = "esat"
     place = make_place({"name": "v", "network": {"net": "x"}, "device": sites}, "v")
     with pytest.raises(
-        TrafficError, match="v: device 'a': junction is 'esat', which does not exist; did you mean 'west'"
+        TrafficError, match=r"v: device 1 \(a\): junction is 'esat', which does not exist; did you mean 'west'"
     ):
         place_devices(place, roads, routes, density)

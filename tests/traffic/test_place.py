@@ -1,9 +1,14 @@
 """Files of places."""
 
+import os
+from pathlib import Path
+
 import pytest
 
+from tests.deadlines import within
 from uavmec_jax.errors import TrafficError
 from uavmec_jax.traffic.place import load_place, make_place, shipped_places
+from uavmec_jax.traffic.sites import load_sites
 
 OSM = {"name": "x", "network": {"osm": "extract.osm"}}
 
@@ -52,9 +57,39 @@ def test_defaults_and_overrides():
         ({"simulation": {"mean_s": [7200.0, 9000.0]}}, "simulation.mean_s is [7200.0, 9000.0]; give [from, to]"),
         ({"devices": {"count": 1}}, "devices.count is 1; it should be greater than or equal to 2"),
         ({"device": [{"name": "a", "junction": "j"}]}, "holds 1 [[device]] tables; give 2 to 1000, or none"),
-        ({"device": [{"name": "a"}, {"name": "b"}]}, "device 'a': place is unclear; give junction, or x_m and y_m"),
-        ({"device": [{"name": "a", "junction": "j", "x_m": 1, "y_m": 2}] * 2}, "device 'a': place is unclear"),
-        ({"device": [{"name": "a", "junction": "j"}] * 2}, "device name 'a' is given twice; names must differ"),
+        ({"device": [{"name": "a"}, {"name": "b"}]}, "device 1 (a): place is unclear; give junction, or x_m and y_m"),
+        ({"device": [{"name": "a", "junction": "j", "x_m": 1, "y_m": 2}] * 2}, "device 1 (a): place is unclear"),
+        (
+            {"device": [{"name": "a", "junction": "j"}, {"name": "b", "junction": "j", "x_m": 1}]},
+            "device 2 (b): place is",
+        ),
+        ({"device": [{"name": "a", "junction": "j"}] * 2}, "devices 1 and 2 are both named 'a'; names must differ"),
+        (
+            {"device": [{"name": "a", "x_m": float("nan"), "y_m": 1.0}]},
+            "device 1 (a): x_m is nan; it should be a finite",
+        ),
+        ({"device": [{"name": "a", "x_m": 1.0, "y_m": 1e300}]}, "device 1 (a): y_m is 1e+300; it should be less than"),
+        (
+            {"device": [{"name": "a", "lon": 1.0, "y_m": 1.0}]},
+            "device 1 (a): gives lon; degrees are not read here, give x_m",
+        ),
+        ({"device": [{"name": "a\x1b[2J"}]}, r"device 1 (a\x1b[2J): name is 'a\x1b[2J'; it should be one line of"),
+        ({"device": [3]}, "device 1 (3): is 3; it should be a valid dictionary"),
+        ({"device": 3}, "device is 3; it should be a valid tuple"),
+        ({"description": "two\nlines"}, "description is 'two\\nlines'; it should be one line of characters"),
+        ({"description": "x" * 1001}, "description is 'xxx"),
+        ({"network": {"osm": "a\0b"}}, r"network.osm is 'a\x00b'; it should be a path without NUL characters"),
+        ({"network": {"osm": ""}}, "network.osm is ''; it should have at least 1 character"),
+        ({"demand": {"vehicles": 10**39}}, "demand.vehicles is 1000"),
+        (
+            {"demand": {"through_per_hour": 1e7}},
+            "demand.through_per_hour is 1e+07; in 2.17 hours that makes 2.17e+07 trips",
+        ),
+        (
+            {"simulation": {"window_s": 1e-310, "duration_s": 1e-310}},
+            "simulation.window_s is 1e-310; it should be greater",
+        ),
+        ({"demand": 3}, "demand is 3; it should be a valid dictionary"),
         ({"name": "../x"}, "name is '../x'"),
     ],
     ids=lambda value: str(value)[:50] if isinstance(value, dict) else "",
@@ -78,3 +113,51 @@ def test_files_that_are_no_places(tmp_path):
     (tmp_path / "empty.toml").write_text("")
     with pytest.raises(TrafficError, match=r"empty.toml: network is missing"):
         load_place(tmp_path / "empty.toml")
+
+
+HOSTILE = {
+    "number of 5,000 digits": (
+        "[demand]\nvehicles = " + "9" * 5000,
+        "not TOML: a whole number has more than 40 digits",
+    ),
+    "20,000 nested brackets": (
+        "device = " + "[" * 20_000 + "]" * 20_000,
+        "is nested too deep; tables and arrays may be",
+    ),
+    "table in place of a number": (
+        "[network]\nosm = 'x'\n[demand.vehicles]\nx = 1",
+        "demand.vehicles is {'x': 1}; it should be a valid integer",
+    ),
+    "number in place of a table": ("demand = 3\n[network]\nosm = 'x'", "demand is 3; it should be a valid dictionary"),
+    "NUL in a path": ('[network]\nosm = "a\\u0000b"', r"network.osm is 'a\x00b'; it should be a path without NUL"),
+    "infinite": ("[network]\nosm = 'x'\n[simulation]\nduration_s = inf", "simulation.duration_s is inf; it should be"),
+}
+
+
+@pytest.mark.parametrize(("text", "line"), HOSTILE.values(), ids=HOSTILE)
+def test_hostile_files_of_places_are_one_line(tmp_path, monkeypatch, text, line):
+    monkeypatch.chdir(tmp_path)
+    Path("p.toml").write_text(text)
+    with within(5), pytest.raises(TrafficError) as caught:
+        load_place("p.toml", {"demand": {"through_per_hour": 1.0}})
+    assert str(caught.value).startswith(f"p.toml: {line}")
+    assert len(str(caught.value)) <= 400
+
+
+@pytest.mark.parametrize(
+    "name", ["p\0.toml", "n" * 5000, "n" * 300 + ".toml"], ids=["nul", "long", "longer than files"]
+)
+def test_names_that_no_file_has_are_one_line(name):
+    with pytest.raises(TrafficError) as caught:
+        load_place(name)
+    assert len(str(caught.value)) <= 400
+
+
+def test_a_fifo_or_a_device_file_as_a_place_is_refused_at_once(tmp_path):
+    os.mkfifo(tmp_path / "pipe.toml")
+    with within(5):
+        for path in (tmp_path / "pipe.toml", Path("/dev/zero")):
+            with pytest.raises(TrafficError, match=f"{path}: cannot be read: is not a regular file"):
+                load_place(path)
+            with pytest.raises(TrafficError, match=f"{path}: cannot be read: is not a regular file"):
+                load_sites(path)

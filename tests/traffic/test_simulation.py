@@ -215,7 +215,7 @@ def test_planted_modules_do_not_run_in_sumo_and_its_helpers(folder, tmp_path, mo
     assert imported_from(tmp_path / "here") == []
 
 
-def test_sumos_last_error_is_reported(folder, monkeypatch):
+def test_sumos_first_error_is_reported(folder, monkeypatch):
     monkeypatch.setattr(
         "uavmec_jax.traffic.simulation.write_trips", lambda path, *_: path.write_text("<routes><trip") or 1
     )

@@ -11,7 +11,7 @@ import pytest
 
 from tests.planted import imported_from, plant
 from uavmec_jax.errors import TrafficError
-from uavmec_jax.traffic.workspace import Workspace, last_error
+from uavmec_jax.traffic.workspace import Workspace, first_error
 
 
 def python(code):
@@ -28,8 +28,9 @@ def test_programs_run_in_a_folder_that_is_removed():
     assert not folder.exists()
 
 
-def test_failures_report_the_last_error():
-    code = "import sys; sys.stderr.write('Warning: a\\nError: the road is cut\\nQuitting (on error).\\n'); sys.exit(1)"
+def test_failures_report_the_first_error():
+    lines = ("Warning: a", "Error: the road is cut", "Error: No edges loaded.", "Quitting (on error).")
+    code = f"import sys; sys.stderr.write({chr(10).join(lines)!r}); sys.exit(1)"
     with Workspace() as workspace:
         with pytest.raises(TrafficError, match=r"^netconvert: the road is cut$"):
             workspace.run("netconvert", python(code), limit_s=20)
@@ -41,8 +42,9 @@ def test_failures_report_the_last_error():
             workspace.run("p", python("import time; time.sleep(60)"), limit_s=0.2)
         folder = workspace.folder
     assert not folder.exists()
-    assert last_error("one\ntwo") == "two"
-    assert last_error("") == ""
+    assert first_error("one\ntwo") == "two"
+    assert first_error("") == ""
+    assert first_error("Error: no such road\nError: Process Error") == "no such road"
 
 
 def test_it_works_on_without_its_watchdog():

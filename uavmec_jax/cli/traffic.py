@@ -188,9 +188,7 @@ def _changes(
     seeds: int | None,
 ) -> dict[str, Any]:
     """Return the changes that the options make to a place, as tables of its file."""
-    from uavmec_jax.errors import TrafficError
-    from uavmec_jax.files.parsing import parse_toml
-    from uavmec_jax.files.reading import read_text
+    from uavmec_jax.traffic.sites import load_sites
 
     demand = {"origins": origins or None, "exits": _exits(exits) or None, "vehicles": vehicles}
     tables: dict[str, dict[str, Any]] = {"demand": demand, "simulation": {"seeds": seeds}}
@@ -208,9 +206,7 @@ def _changes(
             raise InputError(f"--set {dotted}: an option gives it too; leave one of them out")
         changes.setdefault(table, {})[name] = value
     if devices is not None:
-        changes["device"] = parse_toml(read_text(devices, TrafficError), devices, TrafficError).get("device", [])
-        if not changes["device"]:
-            raise InputError(f"{devices}: holds no [[device]] tables")
+        changes["device"] = load_sites(devices)
     return changes
 
 
@@ -250,6 +246,8 @@ def _target(path: Path) -> Path:
     """Check, before anything is simulated, that the file can be written."""
     if path.suffix != ".npz":
         raise InputError(f"--out {path}: ends in {path.suffix!r}; it should end in .npz")
-    if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+    if not os.path.isdir(path.parent) or not os.access(path.parent, os.W_OK):
         raise InputError(f"--out {path}: {path.parent} is not a folder that can be written to")
+    if os.path.lexists(path) and not os.path.isfile(path):
+        raise InputError(f"--out {path}: is not a regular file, and is not replaced; give another name")
     return path

@@ -60,6 +60,9 @@ _BOUNDS = ("gt", "ge", "lt", "le")
 _TYPE_TAG = re.compile(r"int|str|float|bool|(constrained-|tuple\[|dict\[|list\[|function-).*", re.DOTALL)
 """Parts that pydantic adds to the location of an error in a union."""
 
+_SUBJECT = re.compile(r"\b(Input|String|Tuple|List|Dictionary) should")
+"""What pydantic calls a value that should be something else."""
+
 
 class StrictModel(BaseModel):
     """A model that forbids unknown keys and conversions between types, and NaN and infinity unless a field allows them."""
@@ -128,8 +131,8 @@ def suggest(word: str, options: Iterable[str]) -> str:
 
 def expectation(error: Any) -> str:
     """Return what one of pydantic's errors says that the value should be."""
-    message: str = error["msg"]
-    return message.replace("Input should be", "it should be").replace("Value error, ", "")
+    message = _SUBJECT.sub("it should", error["msg"], count=1)
+    return message.replace(" after validation", "").replace("Value error, ", "")
 
 
 def describe_error(source: str, error: pydantic.ValidationError, model: type[BaseModel], data: Any = None) -> str:
@@ -145,8 +148,7 @@ def describe_error(source: str, error: pydantic.ValidationError, model: type[Bas
     if first["type"] == "value_error":
         return f"{source}: {expectation(first)}"
     location = _without_tags(first)
-    table, path = _split_location(location, model, data)
-    subject = f"{source}: {table}{'.'.join(map(str, path))}".rstrip()
+    subject = f"{source}: {_in_words(location, model, data)}".rstrip()
     if first["type"] == "extra_forbidden":
         fields = _fields_at(model, first["loc"][:-1])
         hint = suggest(str(first["loc"][-1]), fields)
@@ -173,14 +175,27 @@ def _without_tags(error: Any) -> list[Any]:
     return [part for part in error["loc"] if not (isinstance(part, str) and _TYPE_TAG.fullmatch(part))]
 
 
-def _split_location(location: list[Any], model: type[BaseModel], data: Any) -> tuple[str, list[Any]]:
-    """Split a location into a table of a list, counted from 1 and named, and the path inside it."""
-    in_list = len(location) > 1 and isinstance(location[1], int) and bool(_fields_at(model, location[:1]))
-    if not in_list or not isinstance(data, dict):
-        return "", location
-    table = data[location[0]][location[1]]
-    name = table.get("name", "no name") if isinstance(table, dict) else table
-    return f"{location[0]} {location[1] + 1} ({name}): ", location[2:]
+def _in_words(location: list[Any], model: type[BaseModel], data: Any) -> str:
+    """Return a location in words: tables of a list and items are counted from 1, and tables named, where data are given."""
+    words = ""
+    for depth, part in enumerate(location):
+        if not isinstance(part, int):
+            words += f".{part}" if words and not words.endswith(": ") else str(part)
+        elif _fields_at(model, location[:depth]):  # of a list of tables
+            words += f" {part + 1}{_name_at(data, location[: depth + 1])}: "
+        else:
+            words += f": item {part + 1}" if words and not words.endswith(": ") else f"item {part + 1}"
+    return words
+
+
+def _name_at(data: Any, location: list[Any]) -> str:
+    """Return the name of a table in brackets, or what stands in its place; empty if the data have nothing there."""
+    for part in location:
+        try:
+            data = data[part]
+        except (LookupError, TypeError):
+            return ""
+    return f" ({data.get('name', 'no name') if isinstance(data, dict) else data})"
 
 
 def _fields_at(model: Any, location: Sequence[Any]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from uavmec_jax.env.layout import Layout, fleet_of
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Policy, Trace, trace
 from uavmec_jax.files.writing import atomic
-from uavmec_jax.reporting.canvas import new_figure
+from uavmec_jax.reporting.canvas import literal, new_figure
 from uavmec_jax.reporting.map_figure import uav_colour
 from uavmec_jax.reporting.road_map import density_legend, draw_roads, draw_sites, set_limits
 from uavmec_jax.traffic.evacuation import Evacuation
@@ -66,7 +66,7 @@ def _draw_slot(
         float(np.max(layout.position)), 1.0
     )  # layouts may be scaled copies of a place
     _draw_traffic(axes[0], evacuation, stops * scale, window)
-    axes[0].set_title(f"{title}: slot {slot + 1}, {elapsed / 60:.0f} min after the order", fontsize=10)
+    axes[0].set_title(f"{literal(title)}: slot {slot + 1}, {elapsed / 60:.0f} min after the order", fontsize=10)
     battery = np.asarray(now.state.battery) / np.asarray(layout.capacity)
     _draw_bars(axes[1], battery, np.asarray(layout.has_power), failed, "battery", 1.0)
     _draw_bars(axes[2], np.asarray(now.state.age), np.asarray(layout.has_comms), failed, "age, slots", age_limit + 1)

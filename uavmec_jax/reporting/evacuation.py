@@ -3,6 +3,7 @@
 from typing import Any
 
 from rich.table import Table
+from rich.text import Text
 
 from uavmec_jax.traffic.evacuation import HIGH_TRAFFIC, Evacuation
 
@@ -16,7 +17,7 @@ def evacuation_table(evacuation: Evacuation) -> Table:
     for k, name in enumerate(evacuation.meta["names"]):
         table.add_row(
             str(k + 1),
-            name,
+            Text(name),  # no markup
             f"{position[k, 0]:.0f}",
             f"{position[k, 1]:.0f}",
             f"{evacuation.density[k]:.1f}",

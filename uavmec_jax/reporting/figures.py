@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from uavmec_jax.reporting.canvas import new_figure
+from uavmec_jax.reporting.canvas import literal, new_figure
 from uavmec_jax.reporting.formatting import slots
 from uavmec_jax.reporting.heat_map import draw_heat_map, heat_map_figure
 from uavmec_jax.reporting.table6 import is_table6, label_rewards
@@ -57,7 +57,9 @@ def grid_figure(results: Results) -> Figure:
     cells, panels = cells.assign(paper=paper), [*panels, ("paper", "the paper, Table 5")]
     figure = heat_map_figure([(cells, panels)], _lifetime_limits(longest), "lifetime, slots")
     seeds, steps = int(cells["seeds"].min()), results.study.steps
-    figure.suptitle(f"{results.study.name}: {len(cells)} cells x {seeds} seeds, {steps:,} steps each", fontsize=11)
+    figure.suptitle(
+        f"{literal(results.study.name)}: {len(cells)} cells x {seeds} seeds, {steps:,} steps each", fontsize=11
+    )
     return figure
 
 
@@ -84,10 +86,10 @@ def ladder_figure(results: Results) -> Figure:
         figure = new_figure(7, 3.6)
         axis = figure.subplots()
         kept = cells[~mostly_censored(cells, names)]
-        axis.barh([title for _, title in panels], [kept[name].mean() for name, _ in panels])
+        axis.barh([literal(title) for _, title in panels], [kept[name].mean() for name, _ in panels])
         axis.set_xlabel("lifetime, slots")
     layouts = int(cells["seeds"].min())
-    figure.suptitle(f"{results.study.name}: {len(cells)} cells x {layouts} layouts", fontsize=11)
+    figure.suptitle(f"{literal(results.study.name)}: {len(cells)} cells x {layouts} layouts", fontsize=11)
     return figure
 
 
@@ -110,7 +112,7 @@ def table6_figure(results: Results) -> Figure:
     figure.colorbar(image, ax=axis, label="lifetime, slots", shrink=0.8)
     seeds = int(cells["seeds"].min())
     axis.set_title(
-        f"{results.study.name}: best weights, mean over {seeds} seeds; columns: powered/connected", fontsize=10
+        f"{literal(results.study.name)}: best weights, mean over {seeds} seeds; columns: powered/connected", fontsize=10
     )
     return figure
 
@@ -134,5 +136,5 @@ def curves_figure(results: Results) -> Figure:
         axis.grid(alpha=0.3)
     right.legend()
     left.set_ylabel("episode length, slots")
-    figure.suptitle(f"{results.study.name}: {len(results.agents)} agents", fontsize=11)
+    figure.suptitle(f"{literal(results.study.name)}: {len(results.agents)} agents", fontsize=11)
     return figure

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
-from uavmec_jax.reporting.canvas import new_figure
+from uavmec_jax.reporting.canvas import literal, new_figure
 
 
 def draw_heat_map(axis: Axes, table: pd.DataFrame, limits: tuple[float, float]) -> AxesImage:
@@ -20,8 +20,8 @@ def draw_heat_map(axis: Axes, table: pd.DataFrame, limits: tuple[float, float]) 
         limits: of the colour scale.
     """
     image = axis.imshow(table.to_numpy(), vmin=limits[0], vmax=limits[1], cmap="viridis")
-    axis.set_xticks(range(table.shape[1]), [str(name) for name in table.columns])
-    axis.set_yticks(range(table.shape[0]), [str(name) for name in table.index])
+    axis.set_xticks(range(table.shape[1]), [literal(name) for name in table.columns])
+    axis.set_yticks(range(table.shape[0]), [literal(name) for name in table.index])
     middle = (limits[0] + limits[1]) / 2
     for (row, column), value in np.ndenumerate(table.to_numpy()):
         if np.isfinite(value):
@@ -49,7 +49,7 @@ def heat_map_figure(
             table = cells.pivot(index="powered", columns="connected", values=column)
             table = table.sort_index(ascending=False).sort_index(axis=1, ascending=False)
             image = draw_heat_map(axis, table, limits)
-            axis.set_title(title, fontsize=10)
+            axis.set_title(literal(title), fontsize=10)
             axis.set_xlabel("connected devices")
         row[0].set_ylabel("powered devices")
     figure.colorbar(image, ax=axes, label=quantity, shrink=0.8)

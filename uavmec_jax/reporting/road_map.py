@@ -7,7 +7,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from uavmec_jax.reporting.canvas import new_figure
+from uavmec_jax.reporting.canvas import literal, new_figure
 from uavmec_jax.traffic.evacuation import Evacuation
 
 COLOURS = ("blue", "cyan", "yellow", "green", "orange", "red", "magenta")
@@ -85,12 +85,12 @@ def draw_map(axis: Axes, evacuation: Evacuation) -> None:
         title="vehicles/km/lane",
         title_fontsize=7,
     )
-    axis.set_title(f"{evacuation.name}: mean of {first / 60:.0f} to {last / 60:.0f} min", fontsize=10)
+    axis.set_title(f"{literal(evacuation.name)}: mean of {first / 60:.0f} to {last / 60:.0f} min", fontsize=10)
 
 
 def map_figure(evacuation: Evacuation) -> Figure:
     """Return the road map of an evacuation, with the description of the place below it."""
     figure = new_figure(7.4, 6.4)
     draw_map(figure.subplots(), evacuation)
-    figure.supxlabel(evacuation.meta["description"], fontsize=7)
+    figure.supxlabel(literal(evacuation.meta["description"]), fontsize=7)
     return figure

@@ -8,7 +8,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from uavmec_jax.reporting.canvas import new_figure
+from uavmec_jax.reporting.canvas import literal, new_figure
 from uavmec_jax.search.search import SearchResult
 from uavmec_jax.search.space import baseline_settings
 
@@ -50,7 +50,7 @@ def history_figure(result: SearchResult) -> Figure:
     axis.plot(pruned["number"], pruned["value"], "x", color="tab:gray", label="pruned, value at its last rung")
     axis.plot(complete["number"], complete["value"], "o", color="tab:blue", label="complete")
     axis.step(complete["number"], complete["value"].cummax(), where="post", color="tab:orange", label="best so far")
-    axis.set(xlabel="trial", ylabel="lifetime, slots", title=result.space.name)
+    axis.set(xlabel="trial", ylabel="lifetime, slots", title=literal(result.space.name))
     axis.legend(loc="lower right")
     axis.grid(alpha=0.3)
     return figure
@@ -69,9 +69,11 @@ def importance_figure(result: SearchResult) -> Figure:
         if labels is None and getattr(result.space.space[setting], "log", False):
             axis.set_xscale("log")
         elif labels is not None:
-            axis.set_xticks(range(len(labels)), labels)
+            axis.set_xticks(range(len(labels)), [literal(label) for label in labels])
         share = result.importance.get(setting)
-        axis.set_title(setting + ("" if share is None else f": importance {share:.0%}"), fontsize=9, loc="left")
+        axis.set_title(
+            literal(setting) + ("" if share is None else f": importance {share:.0%}"), fontsize=9, loc="left"
+        )
         axis.set_ylabel("slots", fontsize=8)
         axis.grid(alpha=0.3)
     return figure

@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from uavmec_jax.errors import TrafficError
-from uavmec_jax.reporting.canvas import new_figure
+from uavmec_jax.reporting.canvas import literal, new_figure
 from uavmec_jax.reporting.road_map import draw_map
 from uavmec_jax.reporting.table7 import count_columns
 from uavmec_jax.studies.first_failures import first_failure_groups
@@ -27,11 +27,11 @@ def table7_figure(results: Results) -> Figure:
         try:
             draw_map(left, load_evacuation(str(counts["place"].iloc[0])))
         except TrafficError as error:
-            left.text(0.5, 0.5, f"no map: {error}", ha="center", va="center", wrap=True, fontsize=8)
+            left.text(0.5, 0.5, literal(f"no map: {error}"), ha="center", va="center", wrap=True, fontsize=8)
             left.set_axis_off()
         _draw_failures(right, counts, name)
     seeds = results.agents["seed"].nunique()
-    figure.suptitle(f"{results.study.name}: {seeds} scenarios, {results.study.steps:,} steps", fontsize=11)
+    figure.suptitle(f"{literal(results.study.name)}: {seeds} scenarios, {results.study.steps:,} steps", fontsize=11)
     return figure
 
 
@@ -47,7 +47,7 @@ def _draw_failures(axis: Axes, counts: pd.DataFrame, name: str) -> None:
     width = 0.8 / len(columns)
     for k, (policy, values) in enumerate(columns.items()):
         colour = "black" if policy == "paper" else None
-        axis.bar(numbers + (k - (len(columns) - 1) / 2) * width, values, width, label=policy, color=colour)
+        axis.bar(numbers + (k - (len(columns) - 1) / 2) * width, values, width, label=literal(policy), color=colour)
     for number in numbers[devices["high_traffic"].to_numpy()]:
         axis.axvspan(number - 0.5, number + 0.5, color="lightgrey", alpha=0.5, zorder=0, lw=0)
     axis.set_xticks(numbers)
@@ -55,4 +55,4 @@ def _draw_failures(axis: Axes, counts: pd.DataFrame, name: str) -> None:
     axis.set_xlabel("device; shaded: in high traffic")
     axis.set_ylabel("first failures")
     axis.legend(fontsize=7)
-    axis.set_title(f"{name}: first failures", fontsize=10)
+    axis.set_title(f"{literal(name)}: first failures", fontsize=10)

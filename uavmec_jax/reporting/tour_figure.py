@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from uavmec_jax.env.layout import fleet_of
 from uavmec_jax.env.rollout import Trace
 from uavmec_jax.planning.plan import Plan
-from uavmec_jax.reporting.canvas import new_figure
+from uavmec_jax.reporting.canvas import literal, new_figure
 from uavmec_jax.reporting.map_figure import draw_depots, draw_devices, uav_colour
 from uavmec_jax.reporting.tours import targets, uav_stops
 from uavmec_jax.scenarios.named_scenario import NamedScenario
@@ -33,7 +33,7 @@ def tour_figure(plan: Plan, scenario: NamedScenario) -> Figure:
         _draw_devices_over_time(row[1], row[2], plan, scenario, tour)
         if panels == 4:
             _draw_energies(row[3], plan, scenario, tour)
-    figure.suptitle(scenario.name, fontsize=11)
+    figure.suptitle(literal(scenario.name), fontsize=11)
     return figure
 
 
@@ -44,7 +44,12 @@ def _draw_devices_over_time(
     slots = np.arange(len(tour.action) + 1)
     for device, label in enumerate(scenario.device_names):
         colour = f"C{device % 10}"
-        style: Any = {"color": colour, "ls": "-" if device < 10 else "--", "lw": 1.3, "label": f"{device + 1} {label}"}
+        style: Any = {
+            "color": colour,
+            "ls": "-" if device < 10 else "--",
+            "lw": 1.3,
+            "label": literal(f"{device + 1} {label}"),
+        }
         if not plan.layout.has_power[device]:
             fraction = tour.state.battery[:, device] / plan.layout.capacity[device]
             battery_axis.plot(slots, np.append(1.0, fraction), **style)
@@ -58,7 +63,7 @@ def _draw_devices_over_time(
 def _draw_energies(axis: Axes, plan: Plan, scenario: NamedScenario, tour: Trace) -> None:
     """Draw the energy in each UAV; it jumps where a depot swaps its battery."""
     slots, full = np.arange(len(tour.action) + 1), fleet_of(plan.params, plan.layout).battery_j
-    for uav, name in enumerate(scenario.uav_names):
+    for uav, name in enumerate(map(literal, scenario.uav_names)):
         energy = np.append(float(full[uav]), tour.state.uav_energy[:, uav]) / 1e3
         axis.plot(slots, energy, color=uav_colour(uav), lw=1.3, label=name)
     _label(axis, "energy, kJ", "UAVs")
@@ -70,7 +75,7 @@ def _draw_map(axis: Axes, plan: Plan, scenario: NamedScenario, tour: Trace, titl
     layout = plan.layout
     if (corners := scenario.region_corners) is not None:
         axis.plot(*np.concatenate([corners, corners[:1]]).T, color="0.7", lw=0.8, ls=":", zorder=0)
-    for uav, name in enumerate(scenario.uav_names):
+    for uav, name in enumerate(map(literal, scenario.uav_names)):
         stops = uav_stops(plan, tour, uav)
         alone = len(scenario.uav_names) == 1
         colour = "0.6" if alone else uav_colour(uav)

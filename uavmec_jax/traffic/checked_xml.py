@@ -13,6 +13,7 @@ from typing import Any
 
 from uavmec_jax.errors import TrafficError
 from uavmec_jax.files.xml import CheckingHandler, RefusedError, copy_xml
+from uavmec_jax.traffic.evacuation_schema import MAX_LANES, MAX_METRES
 
 _ELEMENTS: Mapping[str, tuple[str, ...]] = {
     "osm": ("osm", "bounds", "note", "meta", "remark", "node", "way", "relation", "tag", "nd", "member"),
@@ -35,6 +36,11 @@ _DESCRIPTIONS = {
 }
 _CONFIGURATIONS = ("configuration", "sumoConfiguration", "netconvertConfiguration")
 _POSITIVE = ("speed", "length", "numLanes", "width")
+_COORDINATES = ("x", "y", "z")
+_UNIQUE = ("edge", "lane", "junction")
+"""Elements of a network whose ids must differ; in files of nodes and edges, later elements change earlier ones."""
+
+_OSM_LANES = ("lanes", "lanes:forward", "lanes:backward")
 
 
 @dataclass
@@ -85,6 +91,9 @@ class _Elements(CheckingHandler):
     def __init__(self, kind: str):
         super().__init__()
         self._kind = kind
+        self._ids: set[tuple[str, str]] = set()
+        self._way = ""
+        self._empty_edge = ""
         self.contents = Contents()
 
     def check(self, name: str, attrs: Any) -> None:
@@ -95,12 +104,26 @@ class _Elements(CheckingHandler):
             raise RefusedError(f"holds <{name}>, which is not an element of {_DESCRIPTIONS[self._kind]}")
         self.contents.counts[name] += 1
         if self._kind == "osm":
-            if name == "node":
-                self._add_node(attrs)
+            self._check_map(name, attrs)
             return
         for quantity in _POSITIVE:
             if quantity in attrs:
                 self._check_number(name, attrs, quantity)
+        if self._kind == "net" and name in _UNIQUE:
+            self._check_id(name, attrs)
+            self._empty_edge = _label(name, attrs) if name == "edge" else ""
+        if name in ("node", "junction"):
+            for coordinate in _COORDINATES:
+                if coordinate in attrs:
+                    self._check_coordinates(name, attrs, coordinate)
+        if "shape" in attrs:
+            self._check_coordinates(name, attrs, "shape")
+
+    def endElement(self, name: str) -> None:  # noqa: N802  (SAX's name)
+        """Check that an edge of a network had a lane."""
+        super().endElement(name)
+        if name == "edge" and self._empty_edge:
+            raise RefusedError(f"holds {self._empty_edge}, which has no lanes")
 
     def _check_root(self, name: str) -> None:
         if name in _CONFIGURATIONS:
@@ -116,8 +139,42 @@ class _Elements(CheckingHandler):
         if value == -1 and quantity in ("width", "length"):
             return  # SUMO writes -1 for "not given"
         if not 0 < value < 1e7:
-            element = f"{name} {attrs['id']!r}" if "id" in attrs else f"a {name}"
-            raise RefusedError(f"{quantity} of {element} is {attrs[quantity]!r}; it should be a number above 0")
+            raise RefusedError(
+                f"{quantity} of {_label(name, attrs)} is {attrs[quantity]!r}; it should be a number above 0"
+            )
+        if quantity == "numLanes" and value > MAX_LANES:
+            raise RefusedError(f"numLanes of {_label(name, attrs)} is {attrs[quantity]!r}; give at most {MAX_LANES}")
+
+    def _check_id(self, name: str, attrs: Any) -> None:
+        """Check that an element of a network has an id of its own: of two equal ones, readers take one."""
+        if not attrs.get("id"):
+            raise RefusedError(f"has an element <{name}> without an id")
+        if (name, attrs["id"]) in self._ids:
+            raise RefusedError(f"holds {_label(name, attrs)} twice; ids must differ")
+        self._ids.add((name, attrs["id"]))
+
+    def _check_coordinates(self, name: str, attrs: Any, attribute: str) -> None:
+        """Check that a coordinate, or each in a list of points ``x,y x,y``, is a number of metres on the Earth."""
+        try:
+            values = [float(value) for value in attrs[attribute].replace(",", " ").split()]
+        except ValueError:
+            values = [math.nan]
+        if not all(abs(value) <= MAX_METRES for value in values):
+            raise RefusedError(
+                f"{attribute} of {_label(name, attrs)} is {attrs[attribute][:60]!r}; it should hold metres, numbers of at "
+                f"most {MAX_METRES:g} in size"
+            )
+
+    def _check_map(self, name: str, attrs: Any) -> None:
+        """Check an element of an OpenStreetMap extract: positions, and numbers of lanes that netconvert would build."""
+        if name == "node":
+            self._add_node(attrs)
+        if name in ("node", "way", "relation"):
+            self._way = attrs.get("id", "?") if name == "way" else ""
+        elif name == "tag" and self._way and attrs.get("k") in _OSM_LANES:
+            lanes = attrs.get("v", "").strip()
+            if lanes.isdecimal() and (len(lanes) > 9 or int(lanes) > MAX_LANES):
+                raise RefusedError(f"way {self._way}: {attrs['k']} is {lanes[:40]!r}; give at most {MAX_LANES}")
 
     def _add_node(self, attrs: Any) -> None:
         try:
@@ -127,3 +184,8 @@ class _Elements(CheckingHandler):
         if not (abs(lon) <= 180 and abs(lat) <= 90):
             raise RefusedError(f"node {attrs.get('id', '?')} lies at lon {lon}, lat {lat}, which is not on the Earth")
         self.contents.extend(lon, lat)
+
+
+def _label(name: str, attrs: Any) -> str:
+    """Return how messages name an element."""
+    return f"{name} {attrs['id']!r}" if "id" in attrs else f"a {name}"

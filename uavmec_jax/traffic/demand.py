@@ -151,13 +151,12 @@ def write_trips(path: Path, routes: Routes, demand: Demand, duration_s: float, s
             t, e = divmod(int(pair), len(routes.exits))
             trips.append((time, routes.entries[t].id, routes.exits[e].id, "t"))
     trips.sort()
-    with path.open("w", encoding="utf-8") as file:
-        file.write("<routes>\n")
-        for number, (time, start, end, kind) in enumerate(trips):
-            ends = f"from={quoteattr(start)} to={quoteattr(end)}"
-            speed = "max" if kind == "t" else "0"
-            file.write(
-                f'<trip id="{kind}{number}" depart="{time:.2f}" departLane="best" departSpeed="{speed}" {ends}/>\n'
-            )
-        file.write("</routes>\n")
+    lines = ["<routes>\n"]
+    for number, (time, start, end, kind) in enumerate(trips):
+        ends = f"from={quoteattr(start)} to={quoteattr(end)}"
+        speed = "max" if kind == "t" else "0"
+        lines.append(
+            f'<trip id="{kind}{number}" depart="{time:.2f}" departLane="best" departSpeed="{speed}" {ends}/>\n'
+        )
+    path.write_text("".join([*lines, "</routes>\n"]), encoding="utf-8")
     return len(trips)

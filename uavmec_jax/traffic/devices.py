@@ -7,11 +7,15 @@ from uavmec_jax.errors import TrafficError
 from uavmec_jax.files.validation import suggest
 from uavmec_jax.traffic.demand import Routes
 from uavmec_jax.traffic.network import RoadNetwork
-from uavmec_jax.traffic.place import Place, Placement, Site
+from uavmec_jax.traffic.place import Place, Placement
+from uavmec_jax.traffic.sites import site_label
 from uavmec_jax.traffic.weights import density_near
 
 _CORRIDOR_QUANTILE = 0.8
 """Junctions whose traffic density is at or above this quantile lie on a corridor."""
+
+_MAX_NAME, _SHORT_NAME = 80, 60
+"""Longest name of a device, and what is left of a longer one before its number."""
 
 
 def place_devices(
@@ -32,7 +36,7 @@ def place_devices(
         TrafficError: see :func:`check_devices`.
     """
     if place.device:
-        positions = [_site_position(site, network, place.name) for site in place.device]
+        positions = _site_positions(place, network)
         return [site.name for site in place.device], np.array(positions, float)
     chosen = _choose_junctions(place.devices, network, _nearby_junctions(place, network, routes), density)
     return _junction_names(chosen, network), np.array([network.junctions[junction] for junction in chosen], float)
@@ -46,27 +50,45 @@ def check_devices(place: Place, network: RoadNetwork, routes: Routes) -> None:
     """
     if not place.device:
         _nearby_junctions(place, network, routes)
-    for site in place.device:
-        _site_position(site, network, place.name)
+    _site_positions(place, network)
 
 
 def _junction_names(junctions: list[str], network: RoadNetwork) -> list[str]:
-    """Name each junction by the streets that meet there, with its id where two names are equal; or by its id."""
-    streets = [" and ".join(network.streets_at(junction)[:2]) or junction for junction in junctions]
+    """Name each junction by the streets that meet there, with its id where two names are equal; or by its id.
+
+    Names differ, can be printed, and are as long as those of devices may be.
+    """
+    streets = [_one_line(" and ".join(network.streets_at(junction)[:2])) or junction for junction in junctions]
     repeated = {name for name in streets if streets.count(name) > 1}
-    return [f"{name} ({id_})" if name in repeated else name for name, id_ in zip(streets, junctions, strict=True)]
+    names: list[str] = []
+    for number, (street, id_) in enumerate(zip(streets, junctions, strict=True), 1):
+        name = f"{street} ({id_})" if street in repeated else street
+        if len(name) > _MAX_NAME or name in names:
+            name = f"{street[:_SHORT_NAME]} ({number})"
+        names.append(name)
+    return names
 
 
-def _site_position(site: Site, network: RoadNetwork, name: str) -> tuple[float, float]:
-    """Return the position of a site in metres; ``name`` is that of the place, for error messages."""
-    if site.junction is None:
-        assert site.x_m is not None
-        assert site.y_m is not None
-        return site.x_m, site.y_m
-    if site.junction not in network.junctions:
-        hint = suggest(site.junction, network.junctions)
-        raise TrafficError(f"{name}: device {site.name!r}: junction is {site.junction!r}, which does not exist; {hint}")
-    return network.junctions[site.junction]
+def _one_line(name: str) -> str:
+    """Return a name from a map without what cannot be printed."""
+    return "".join(letter for letter in " ".join(name.split()) if letter.isprintable())
+
+
+def _site_positions(place: Place, network: RoadNetwork) -> list[tuple[float, float]]:
+    """Return the positions of a place's sites in metres."""
+    positions = []
+    for number, site in enumerate(place.device, 1):
+        if site.junction is None:
+            assert site.x_m is not None
+            assert site.y_m is not None
+            positions.append((site.x_m, site.y_m))
+        elif site.junction in network.junctions:
+            positions.append(network.junctions[site.junction])
+        else:
+            hint = suggest(site.junction, network.junctions)
+            label = site_label(number, site.name)
+            raise TrafficError(f"{place.name}: {label}: junction is {site.junction!r}, which does not exist; {hint}")
+    return positions
 
 
 def _nearby_junctions(place: Place, network: RoadNetwork, routes: Routes) -> Int[np.ndarray, " J"]:

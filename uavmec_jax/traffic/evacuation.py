@@ -1,5 +1,6 @@
 """The result of a simulated evacuation: one small file, which training, evaluation and figures read without SUMO."""
 
+import os
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -8,8 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from uavmec_jax.errors import TrafficError
-from uavmec_jax.files.archives import read_checked, write_checked
+from uavmec_jax.files.archives import MAX_USER_BYTES, read_checked, write_checked
 from uavmec_jax.files.validation import suggest
+from uavmec_jax.traffic.evacuation_schema import check_evacuation
 from uavmec_jax.traffic.place import PLACES, shipped_places
 
 SCHEMA = 1
@@ -82,9 +84,16 @@ class Evacuation:
 
         Args:
             scale_to_m: length to which the box's longer side is scaled; by default distances are the real ones.
+
+        Raises:
+            TrafficError: the box has no side that could be scaled.
         """
         local = self.position - self.position.min(axis=0)
-        return local if scale_to_m is None else local * (scale_to_m / local.max())
+        if scale_to_m is None:
+            return local
+        if not local.max() > 0:
+            raise TrafficError(f"{self.name}: all devices stand at one point; leave out place_scale_m")
+        return local * (scale_to_m / local.max())
 
     def region_m(self, scale_to_m: float | None = None) -> tuple[float, float]:
         """Return the sides of the devices' bounding box in metres, each at least 1; see :meth:`local_position`."""
@@ -109,8 +118,13 @@ class Evacuation:
             )
 
     def save(self, path: str | Path) -> None:
-        """Write the file atomically."""
+        """Write the file atomically.
+
+        Raises:
+            TrafficError: something is not what :func:`load_evacuation` would accept; nothing is written.
+        """
         arrays = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "meta"}
+        check_evacuation(path, self.meta, arrays)
         write_checked(Path(path), SCHEMA, {"meta": self.meta}, arrays)
 
 
@@ -118,16 +132,17 @@ def load_evacuation(source: str | Path) -> Evacuation:
     """Load the evacuation of a place that ships with the package (``"albany"``, ``"round_lake"``), or of a file.
 
     Raises:
-        TrafficError: no shipped place has that name; the file does not exist, is damaged, was altered, or is of another kind
-            or version; one line.
+        TrafficError: no shipped place has that name; the file does not exist, is damaged, was altered, is of another kind or
+            version, or holds something that no evacuation has; one line.
     """
     path = Path(source)
     if str(source) in shipped_places():
         path = Path(str(PLACES / str(source) / "evacuation.npz"))
-    elif not path.exists() and not path.suffix:
+    elif not path.suffix and not os.path.lexists(path):
         raise TrafficError(f"{source}: neither a file nor a shipped place; {suggest(str(source), shipped_places())}")
-    facts, arrays = read_checked(path, SCHEMA, "an evacuation", TrafficError)
+    facts, arrays = read_checked(path, SCHEMA, "an evacuation", TrafficError, max_bytes=MAX_USER_BYTES)
     expected = {field.name for field in fields(Evacuation)} - {"meta"}
     if set(arrays) != expected or "meta" not in facts:
         raise TrafficError(f"{path}: is not an evacuation: it holds {', '.join(sorted(arrays))}")
+    check_evacuation(path, facts["meta"], arrays)
     return Evacuation(meta=facts["meta"], **arrays)

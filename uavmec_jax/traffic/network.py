@@ -15,9 +15,12 @@ import platformdirs
 from jaxtyping import Float, Int
 
 from uavmec_jax.errors import TrafficError
+from uavmec_jax.files import xml
+from uavmec_jax.files.reading import read_bytes
 from uavmec_jax.files.writing import atomic
 from uavmec_jax.traffic import sumo
 from uavmec_jax.traffic.checked_xml import Contents, checked_copy
+from uavmec_jax.traffic.evacuation_schema import MAX_LANES, MAX_METRES, MAX_ROADS
 from uavmec_jax.traffic.place import NetworkSource
 from uavmec_jax.traffic.workspace import Workspace
 
@@ -28,6 +31,7 @@ RESIDENTIAL = ("residential", "living_street", "unclassified")
 """Classes of roads where people live, in order of preference: the first class that a network has is used."""
 
 _BUILD_LIMIT_S = 900.0
+_MAX_ID = 1000
 _PLAIN = ("nodes", "edges", "types")
 _PLAIN_OPTIONS = ("--offset.disable-normalization", "true")
 _OSM_OPTIONS = (
@@ -195,7 +199,7 @@ def _cache_path(options: list[str], workspace: Workspace) -> Path:
     digest = hashlib.sha256("\n".join([sumo.version(), *options]).encode())
     for option in options:
         if option.endswith(".xml"):
-            digest.update((workspace.folder / option).read_bytes())
+            digest.update(read_bytes(workspace.folder / option, TrafficError, max_bytes=xml.MAX_BYTES))
     return Path(platformdirs.user_cache_dir("uavmec-jax")) / "networks" / f"{digest.hexdigest()}.net.xml"
 
 
@@ -211,13 +215,13 @@ def read_network(file: Path, name: str) -> RoadNetwork:
     """Read the roads and junctions of a checked network file; ``name`` stands for it in messages.
 
     Raises:
-        TrafficError: SUMO is missing, or there are no roads or junctions.
+        TrafficError: SUMO is missing, the network holds a road that no car can drive on, or there are no roads or junctions.
     """
     try:
         net = sumo.read_network(file)
+        roads = {edge.getID(): _make_road(edge) for edge in net.getEdges() if edge.allows("passenger")}
     except TrafficError as error:
         raise TrafficError(f"{name}: {error}") from None
-    roads = {edge.getID(): _make_road(edge) for edge in net.getEdges() if edge.allows("passenger")}
     successors = {
         edge.getID(): tuple(after.getID() for after in edge.getOutgoing() if after.getID() in roads)
         for edge in net.getEdges()
@@ -227,15 +231,36 @@ def read_network(file: Path, name: str) -> RoadNetwork:
     junctions = {node.getID(): node.getCoord()[:2] for node in net.getNodes() if node.getID() in used}
     if not roads or len(junctions) < 2:
         raise TrafficError(f"{name}: has no junctions with roads for cars between them")
+    if len(roads) > MAX_ROADS:
+        raise TrafficError(f"{name}: has {len(roads):,} roads; cut out an area with at most {MAX_ROADS:,}")
     return RoadNetwork(roads, successors, junctions, _digest(file), file)
 
 
 def _digest(file: Path) -> str:
     """Return the SHA-256 of a network without its comments, one of which holds the date on which it was built."""
-    return hashlib.sha256(re.sub(rb"<!--.*?-->", b"", file.read_bytes(), flags=re.DOTALL)).hexdigest()
+    content = read_bytes(file, TrafficError, max_bytes=xml.MAX_BYTES)
+    return hashlib.sha256(re.sub(rb"<!--.*?-->", b"", content, flags=re.DOTALL)).hexdigest()
 
 
 def _make_road(edge: Any) -> Road:
+    """Make a road of an edge of sumolib's, which takes what it is given.
+
+    Raises:
+        TrafficError: a junction at its ends does not exist, or its id, lanes or shape are not those of a road.
+    """
+    label = f"edge {edge.getID()!r}"
+    if not edge.getID().isprintable() or len(edge.getID()) > _MAX_ID:
+        raise TrafficError(f"{label}: its id should be at most {_MAX_ID} characters that can be printed")
+    for verb, node in (("begins", edge.getFromNode()), ("ends", edge.getToNode())):
+        if node is None:
+            raise TrafficError(f"{label}: {verb} at no junction; give from and to")
+        if node.getCoord3D() is None:  # sumolib has made it up
+            raise TrafficError(f"{label}: {verb} at junction {node.getID()!r}, which does not exist")
+        _check_points([node.getCoord()[:2]], f"junction {node.getID()!r}")
+    if edge.getLaneNumber() > MAX_LANES:
+        raise TrafficError(f"{label}: has {edge.getLaneNumber()} lanes; give at most {MAX_LANES}")
+    if any(len(lane.getShape()) < 2 for lane in edge.getLanes()):
+        raise TrafficError(f"{label}: has a lane without a shape; give at least two points")
     return Road(
         id=edge.getID(),
         name=edge.getName() or "",
@@ -245,5 +270,13 @@ def _make_road(edge: Any) -> Road:
         length_m=edge.getLength(),
         start=edge.getFromNode().getID(),
         end=edge.getToNode().getID(),
-        shape=np.array([point[:2] for point in edge.getShape()], float),
+        shape=_check_points([point[:2] for point in edge.getShape()], label),
     )
+
+
+def _check_points(points: list[Any], label: str) -> Float[np.ndarray, "k 2"]:
+    """Return points as an array, after checking that they are metres on the Earth."""
+    shape = np.array(points, float)
+    if not (np.abs(shape) <= MAX_METRES).all():
+        raise TrafficError(f"{label}: has a coordinate that is not a number of metres up to {MAX_METRES:g}")
+    return shape

@@ -1,20 +1,34 @@
 """Places: a road network, its travel demand and its devices, read from TOML; every value is checked."""
 
+import os
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
 
 import pydantic
-from pydantic import Field
+from pydantic import AfterValidator, Field
+from pydantic_core import PydanticCustomError
 
 from uavmec_jax.env.params import MAX_DEVICES
 from uavmec_jax.errors import TrafficError
 from uavmec_jax.files.parsing import parse_toml
 from uavmec_jax.files.reading import read_text
-from uavmec_jax.files.validation import StrictModel, describe_error, from_array, suggest
+from uavmec_jax.files.validation import PrintableText, StrictModel, from_array, suggest, validated
+from uavmec_jax.traffic.sites import Sites, check_sites, refuse_degrees
+
+MAX_TRIPS = 2_000_000
+"""Most trips of one simulation: an evacuation of the most vehicles, and as many that pass through."""
+
+
+def _check_path(path: str) -> str:
+    if "\0" in path:
+        raise PydanticCustomError("path", "Input should be a path without NUL characters")
+    return path
+
 
 _Positive = Annotated[float, Field(gt=0, le=1e7)]
 _NotNegative = Annotated[float, Field(ge=0, le=1e7)]
+_FilePath = Annotated[str, Field(min_length=1, max_length=4096), AfterValidator(_check_path)]
 
 PLACES = resources.files("uavmec_jax.traffic") / "places"
 
@@ -27,15 +41,15 @@ def shipped_places() -> tuple[str, ...]:
 class NetworkSource(StrictModel):
     """The files that the roads come from, of one of three kinds. Paths are relative to the file of the place."""
 
-    nodes: str | None = None
+    nodes: _FilePath | None = None
     """SUMO's plain XML, together with ``edges`` and ``types``."""
-    edges: str | None = None
-    types: str | None = None
-    osm: str | None = None
+    edges: _FilePath | None = None
+    types: _FilePath | None = None
+    osm: _FilePath | None = None
     """An OpenStreetMap extract: .osm, .osm.gz or .osm.bz2."""
     bbox: Annotated[tuple[float, float, float, float] | None, from_array] = None
     """Part of the extract: west, south, east, north, in degrees."""
-    net: str | None = None
+    net: _FilePath | None = None
     """A network built by SUMO's netconvert."""
 
     @pydantic.model_validator(mode="after")
@@ -63,9 +77,9 @@ class Demand(StrictModel):
     """Vehicles per hour that pass through, from one highway end to another."""
     warm_up_s: _NotNegative = 600.0
     """Seconds of through traffic before the order to leave."""
-    origins: Annotated[tuple[str, ...], from_array] = ()
+    origins: Annotated[tuple[PrintableText, ...], Field(max_length=10_000), from_array] = ()
     """Roads where people live, weighted by their lengths; by default the residential roads."""
-    exits: dict[str, _Positive] = Field(default_factory=dict)
+    exits: dict[PrintableText, _Positive] = Field(default_factory=dict, max_length=1000)
     """Junctions or roads where vehicles leave -> weight; by default the highway ends, weighted by lanes times speed."""
     rerouting: Annotated[float, Field(ge=0, le=1)] = 1.0
     """Share of the drivers who look for a faster route on the way."""
@@ -77,7 +91,7 @@ class Simulation(StrictModel):
     seeds: Annotated[int, Field(ge=1, le=1000)] = 5
     duration_s: _Positive = 7200.0
     """Seconds simulated after the order to leave."""
-    window_s: _Positive = 600.0
+    window_s: Annotated[float, Field(ge=1, le=1e7)] = 600.0
     """Length of the windows over which densities are averaged."""
     mean_s: Annotated[tuple[_NotNegative, _Positive], from_array] = (0.0, 3600.0)
     """Part of the evacuation over which the devices' weights are averaged."""
@@ -112,21 +126,6 @@ class Simulation(StrictModel):
         return round(self.mean_s[0] / self.window_s), min(round(self.mean_s[1] / self.window_s), self.n_windows)
 
 
-class Site(StrictModel):
-    """A device of the file: at a junction, or at a point of the network in metres."""
-
-    name: Annotated[str, Field(min_length=1, max_length=80)]
-    junction: str | None = None
-    x_m: float | None = None
-    y_m: float | None = None
-
-    @pydantic.model_validator(mode="after")
-    def _check(self) -> "Site":
-        if (self.junction is None) != (self.x_m is not None and self.y_m is not None):
-            raise ValueError(f"device {self.name!r}: place is unclear; give junction, or x_m and y_m")
-        return self
-
-
 class Placement(StrictModel):
     """How to place devices that the file does not list: at junctions far apart, a share of them on busy corridors."""
 
@@ -143,21 +142,28 @@ class Place(StrictModel):
     """A place and its evacuation."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=80)]
-    description: str = ""
+    description: PrintableText = ""
     network: NetworkSource
     demand: Demand = Demand()
     simulation: Simulation = Simulation()
     devices: Placement = Placement()
-    device: Annotated[tuple[Site, ...], from_array] = ()
+    device: Sites = ()
+
+    @pydantic.model_validator(mode="before")
+    @classmethod
+    def _check_data(cls, data: Any) -> Any:
+        return refuse_degrees(data)
 
     @pydantic.model_validator(mode="after")
     def _check(self) -> "Place":
-        names = [site.name for site in self.device]
-        if self.device and not 2 <= len(names) <= MAX_DEVICES:
-            raise ValueError(f"holds {len(names)} [[device]] tables; give 2 to {MAX_DEVICES}, or none")
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"device name {name!r} is given twice; names must differ")
+        if self.device:
+            check_sites(self.device)
+        hours = (self.demand.warm_up_s + self.simulation.duration_s) / 3600
+        if (trips := self.demand.vehicles + self.demand.through_per_hour * hours) > MAX_TRIPS:
+            raise ValueError(
+                f"demand.through_per_hour is {self.demand.through_per_hour:g}; in {hours:.3g} hours that makes {trips:.3g} "
+                f"trips with the evacuated vehicles; give at most {MAX_TRIPS:,} trips"
+            )
         return self
 
 
@@ -179,13 +185,17 @@ def load_place(source: str | Path, overrides: dict[str, Any] | None = None) -> t
         path = Path(str(PLACES / str(source) / "place.toml"))
     else:
         path = Path(source)
-        if not path.is_file():
+        if not path.suffix and not os.path.lexists(path):
             raise TrafficError(
                 f"{source}: neither a file nor a shipped place; {suggest(str(source), shipped_places())}"
             )
     data = parse_toml(read_text(path, TrafficError), path, TrafficError)
     for table, settings in (overrides or {}).items():
-        data[table] = data.get(table, {}) | settings if isinstance(settings, dict) else settings
+        if not isinstance(settings, dict):
+            data[table] = settings
+        elif settings:
+            given = data.get(table, {})
+            data[table] = given | settings if isinstance(given, dict) else given
     data.setdefault("name", path.stem)
     return make_place(data, str(path)), path.parent
 
@@ -196,7 +206,4 @@ def make_place(data: dict[str, Any], source: str) -> Place:
     Raises:
         TrafficError: a value is invalid; one line.
     """
-    try:
-        return Place.model_validate(data)
-    except pydantic.ValidationError as error:
-        raise TrafficError(describe_error(source, error, Place)) from None
+    return validated(Place, data, source, TrafficError)

@@ -12,11 +12,15 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from uavmec_jax.errors import TrafficError
+from uavmec_jax.files.archives import load_arrays
 from uavmec_jax.traffic import sumo
 from uavmec_jax.traffic.demand import Routes, write_trips
 from uavmec_jax.traffic.network import RoadNetwork
 from uavmec_jax.traffic.place import Demand, Simulation
 from uavmec_jax.traffic.workspace import Workspace
+
+MAX_DENSITIES = 2**28
+"""Most densities of all simulations together: 1 GiB."""
 
 _WARNING_SHARE = 0.02
 """Share of the vehicles that may be unfinished, or teleported, without a warning."""
@@ -71,9 +75,15 @@ def simulate(
         on_done: called with the number of finished simulations.
 
     Raises:
-        TrafficError: SUMO is missing, failed (the message is its last error) or took too long.
+        TrafficError: SUMO is missing, failed (the message is its first error) or took too long.
     """
     sumo.version()  # fails before anything is written if SUMO is missing
+    numbers = simulation.seeds * simulation.n_windows * len(network.roads)
+    if numbers > MAX_DENSITIES:
+        raise TrafficError(
+            f"simulation: {simulation.seeds} seeds, {simulation.n_windows} windows and {len(network.roads):,} roads make "
+            f"{numbers:.3g} densities; at most {MAX_DENSITIES:.3g} are kept; give fewer seeds or longer windows"
+        )
     jobs = [_write_job(seed, network, routes, demand, simulation, workspace) for seed in range(simulation.seeds)]
     with ThreadPoolExecutor(max_workers=min(simulation.seeds, os.cpu_count() or 1)) as pool:
         futures = [pool.submit(_run_job, job, simulation.time_limit_s, workspace) for job in jobs]
@@ -131,5 +141,5 @@ def _run_job(job: Path, limit_s: float, workspace: Workspace) -> Path:
 
 
 def _read_result(path: Path) -> dict[str, np.ndarray]:
-    with np.load(path, allow_pickle=False) as arrays:
-        return {name: arrays[name] for name in Densities.__annotations__}
+    arrays = load_arrays(path)
+    return {name: arrays[name] for name in Densities.__annotations__}

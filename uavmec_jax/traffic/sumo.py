@@ -56,11 +56,12 @@ def read_network(path: Path) -> Any:
     """Read a checked network file into sumolib's ``Net``, without internal edges.
 
     Raises:
-        TrafficError: SUMO is not installed, or cannot read the network.
+        TrafficError: SUMO is not installed, or cannot read the network; the line is without the name of the file.
     """
     try:
         return _import_module("sumolib.net").readNet(str(path), withInternal=False)
     except TrafficError:
         raise
     except Exception as error:  # sumolib trusts its input; bad input raises exceptions of all kinds
-        raise TrafficError(f"{path.name}: is not a network that SUMO can read: {error!r}") from None
+        reason = f"{error} is missing" if isinstance(error, KeyError) else str(error) or type(error).__name__
+        raise TrafficError(f"is not a network that SUMO can read: {reason}") from None

@@ -82,7 +82,7 @@ class Workspace:
             env: environment variables, added to those of this process.
 
         Raises:
-            TrafficError: the program failed (the message is its last error) or took too long.
+            TrafficError: the program failed (the message is its first error) or took too long.
         """
         with self._start(command, env) as process:
             try:
@@ -93,7 +93,9 @@ class Workspace:
                 process.kill()
                 self._notify_watchdog("-", process)
         if process.returncode != 0:
-            raise TrafficError(f"{name}: {last_error(stderr + stdout) or f'ended with exit code {process.returncode}'}")
+            raise TrafficError(
+                f"{name}: {first_error(stderr + stdout) or f'ended with exit code {process.returncode}'}"
+            )
         return stdout
 
     def _start(self, command: Sequence[str | Path], env: Mapping[str, str] | None) -> subprocess.Popen:
@@ -124,8 +126,11 @@ class Workspace:
                 self._watchdog.stdin.flush()
 
 
-def last_error(output: str) -> str:
-    """Return the last line that reports an error, without the word ``Error``; the last line if none does."""
+def first_error(output: str) -> str:
+    """Return the first line that reports an error, without the word ``Error``; the last line if none does.
+
+    The first is the cause: SUMO's programs go on to complain about what is missing as a consequence.
+    """
     lines = [line.strip() for line in output.splitlines() if line.strip() and not line.startswith("Quitting")]
     errors = [line for line in lines if line.startswith("Error")]
-    return (errors or lines or [""])[-1].removeprefix("Error:").strip()
+    return (errors[:1] or lines[-1:] or [""])[0].removeprefix("Error:").strip()
