@@ -12,7 +12,10 @@ from tests.runs.processes import TINY, environment
 from uavmec_jax.files.output_folders import WORK
 from uavmec_jax.runs.results_folder import load_results
 
-DEVICES = "name,x,y,power,comms\nmill,10,10,yes,yes\nferry,{x},80,no,yes\n"
+DEVICES = """name,x_m,y_m,type,task,capacity_j,power,comms
+north,100,100,Firefly,HAAR,60000,no,no
+south,{x},300,Firefly,DNN,60000,no,yes
+"""
 
 IN_ONE_SECOND = """
 import types
