@@ -185,7 +185,10 @@ BAD = [
         "bad.toml: params.end is 'horizon', and algorithm is 'dqn', whose replay of the paper's observation holds no ages",
     ),
     ({"evaluation.beam_width": 0}, "bad.toml: evaluation.beam_width is 0; it should be greater than or equal to 1"),
-    ({"evaluation.draws": 4, "evaluation.planner_draws": 5}, "evaluation.planner_draws is 5; give at most evaluation.draws"),
+    (
+        {"evaluation.draws": 4, "evaluation.planner_draws": 5},
+        "bad.toml: evaluation.planner_draws is 5; give at most eval",
+    ),
     ({"evaluation.planner_draws": 0}, "bad.toml: evaluation.planner_draws is 0; it should be greater"),
     ({"name": "../x"}, "bad.toml: name is '../x'"),
 ]
