@@ -192,7 +192,7 @@ BAD = [
     ({"evaluation.beam_width": 0}, "bad.toml: evaluation.beam_width is 0; it should be greater than or equal to 1"),
     (
         {"evaluation.draws": 4, "evaluation.planner_draws": 5},
-        "evaluation.planner_draws is 5; give at most evaluation.draws",
+        "bad.toml: evaluation.planner_draws is 5; give at most eval",
     ),
     ({"evaluation.planner_draws": 0}, "bad.toml: evaluation.planner_draws is 0; it should be greater"),
     ({"name": "../x"}, "bad.toml: name is '../x'"),
