@@ -20,6 +20,7 @@ from fuzz_campaign import Campaign, shares
 from fuzz_worker import again, corpus_in
 from reports import write_report
 
+from uavmec_jax.errors import one_line
 from uavmec_jax.files.writing import write_text
 from uavmec_jax.training import host
 
@@ -34,7 +35,7 @@ def table(report: dict) -> str:
     ]
     failures = [
         f"- {row['what']}, {row['count']} times, first in `{row['first']}`: `{row['where']}`: "
-        + row["message"].replace("`", "'").encode("ascii", "backslashreplace").decode()[:200]
+        + one_line(row["message"][:200]).replace("`", "'").encode("ascii", "backslashreplace").decode()
         for row in report["failures"]
     ]
     found = "\n".join(failures) or "None."

@@ -175,7 +175,7 @@ def refusal(message: str, where: str) -> Verdict:
         else ""
     )
     if wrong:
-        return Verdict("failure", "message", where, f"{wrong}: {message[:200]!r}")
+        return Verdict("failure", "message", where or message[:40], f"{wrong}: {message[:200]!r}")
     return Verdict("refused", where=where, message=message)
 
 

@@ -44,7 +44,11 @@ BASE: dict[str, list[list[str]]] = {
         ["village.csv"],
     ],
     "plan": [["harbour.toml"], ["--seed", "3"], ["harbour_fleet.toml"]],
-    "evaluate": [["oldest-first"], ["weights.npz", "--agent", "seed=0"], ["finished", "--powered", "12"]],
+    "evaluate": [
+        ["oldest-first"],
+        ["weights.npz", "--agent", "seed=0", "--agent", "powered=12"],
+        ["finished", "--powered", "12"],
+    ],
     "show": [["finished"], ["young"]],
     "compare": [["finished", "finished", "--policy-b", "oldest-first"]],
     "validate": [["tiny.toml"], ["table6", "--json"]],
