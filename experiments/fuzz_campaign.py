@@ -37,7 +37,7 @@ def shares(inputs: int, calls: int, corpus: Path, only: list[str] | None) -> lis
     for weights, total in ((files, inputs), (functions, calls)):
         chosen = {name: weight for name, weight in weights.items() if not only or any(word in name for word in only)}
         scale = total / max(sum(chosen.values()), 1)
-        tasks += [(name, 0, max(1, -int(-weight * scale // 1))) for name, weight in chosen.items() if total]
+        tasks += [(name, 0, count) for name, weight in chosen.items() if (count := round(weight * scale))]
     return tasks
 
 
@@ -91,7 +91,7 @@ class Campaign:
 
     Attributes:
         seed: of all inputs.
-        work: the folder of :class:`Worker`.
+        work: the folder of :class:`Worker`, for one campaign at a time.
         tell: called with a line for every kind that is done.
     """
 

@@ -92,9 +92,9 @@ def test_numbers_that_no_json_has_are_written():
 
 @pytest.mark.slow
 def test_a_small_campaign(tmp_path):
-    run("fuzz.py", "--inputs", 700, "--calls", 40, "--out", tmp_path)
+    run("fuzz.py", "--inputs", 600, "--calls", 40, "--out", tmp_path)
     report = json.loads((tmp_path / "fuzz.json").read_text())
-    assert report["all"]["inputs"] >= 740
+    assert report["all"]["inputs"] > 600
     assert "calls" in report["kinds"]
     assert report["failures"] == []
     assert "| **all** |" in (tmp_path / "README.md").read_text()
