@@ -74,7 +74,7 @@ def test_simulate():
         ),
         (["run", "table5", "--set", "axes.seeds=40_000_000"], "uavmec: table5: 1,000,000,000 agents need 93,132 GiB"),
         (["search", "nowhere"], "uavmec: nowhere: neither a file of a search space nor a shipped one; known: dqn"),
-        (["search", "dqn", "--out", "."], "uavmec: .: is not empty and holds no search"),
+        (["search", "dqn", "--out", "."], "uavmec: .: exists and is not an empty folder; give another one with --out"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

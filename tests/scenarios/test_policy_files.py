@@ -101,7 +101,7 @@ BAD_HEADERS = {
     ),
     "huge network": (
         {"settings.dqn.hidden": [10**9]},
-        "hidden.0 is 1000000000; it should be less than or equal to 4096",
+        "hidden: item 1 is 1000000000; it should be less than or equal to 4096",
     ),
     "deep network": ({"settings.dqn.hidden": [4] * 100_000}, "hidden"),
     "number beyond int64": ({"settings.dqn.learning_starts": 10**30}, "learning_starts is 1"),
@@ -114,9 +114,9 @@ BAD_HEADERS = {
     "devices as text": ({"n_devices": "12"}, "n_devices is '12'; it should be a valid integer"),
     "no agents": ({"agents.dqn": []}, "agents.dqn is []"),
     "agents as a number": ({"agents": 3}, "agents is 3; it should be a valid dictionary"),
-    "agent as a number": ({"agents.dqn.1": 3}, "agents.dqn.1 is 3; it should be a valid dictionary"),
+    "agent as a number": ({"agents.dqn.1": 3}, "agents.dqn: item 2 is 3; it should be a valid dictionary"),
     "one agent too many": ({"agents.dqn": HEADER["agents"]["dqn"] * 2}, "its weights do not fit its dqn network"),
-    "table in an agent": ({"agents.dqn.0.seed": {"a": 1}}, "agents.dqn.0.seed is {'a': 1}"),
+    "table in an agent": ({"agents.dqn.0.seed": {"a": 1}}, "agents.dqn: item 1: seed is {'a': 1}"),
     "agent's own setting": (
         {"agents.dqn.1.gamma": 7.0},
         "agent 2 of dqn: gamma is 7.0; it should be less than or equal",

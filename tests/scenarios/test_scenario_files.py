@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from uavmec_jax.env.hardware import ACTIVE_POWER_W, PROCESSING_RATE_BYTES_S, STANDBY_POWER_W
+from uavmec_jax.env.hardware import ACTIVE_POWER_W, PROCESSING_RATE_BYTES_S, STANDBY_POWER_W, UNLISTED
 from uavmec_jax.env.params import Params
 from uavmec_jax.errors import ScenarioError
-from uavmec_jax.scenarios.inventory import UNLISTED
 from uavmec_jax.scenarios.named_scenario import name_scenario
 from uavmec_jax.scenarios.scenario_files import load_scenario_file, scenario_text
 from uavmec_jax.scenarios.seeds import layout_for_seed

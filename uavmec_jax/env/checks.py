@@ -18,11 +18,19 @@ import numpy as np
 
 from uavmec_jax.errors import ArgumentError
 
-LARGEST = 1e12
-"""Largest number where nothing else is said: far beyond any quantity in SI units, and far from overflow in float32."""
+SMALLEST, LARGEST = 1e-6, 1e12
+"""Bounds of quantities in SI units where nothing else is said: far beyond any device or UAV, and float32 holds products of a
+few of them."""
 
-_SMALLEST = float(np.finfo(np.float32).tiny)  # in single precision, what is closer to 0 counts as 0,
-_GREATEST = float(np.finfo(np.float32).max)  # and what is further from 0 as infinite
+LEAST_CAPACITY_J = 1e-3
+"""Smallest capacity of a device's battery."""
+
+MAX_LENGTH_M = 1e7
+"""Largest coordinate, side of a region, altitude and signal range: beyond it, squares of distances lose their metres in
+float32."""
+
+_TINY = float(np.finfo(np.float32).tiny)  # in single precision, what is closer to 0 counts as 0,
+_HUGE = float(np.finfo(np.float32).max)  # and what is further from 0 as infinite
 
 _debugging = jax.make_user_context(False)
 """Whether traced values are checked: a part of the key of ``jit``'s caches, so other programs are compiled inside."""
@@ -77,21 +85,20 @@ class Bounds:
 
     def admits(self, value: float) -> bool:
         """Return whether a number is in the range; one too small for single precision counts as 0."""
-        value = 0 if -_SMALLEST < value < _SMALLEST else value
+        value = 0 if -_TINY < value < _TINY else value
         return (
             (self.ge is None or value >= self.ge)
             and (self.gt is None or value > self.gt)
             and (self.le is None or value <= self.le)
             and (self.lt is None or value < self.lt)
-            and (value == value if self.infinite else -_GREATEST <= value <= _GREATEST)
+            and (value == value if self.infinite else -_HUGE <= value <= _HUGE)
         )
 
 
-POSITION = Bounds(ge=-1e7, le=1e7)
+POSITION = Bounds(ge=-MAX_LENGTH_M, le=MAX_LENGTH_M)
 """Coordinates, m."""
 
-
-CAPACITY = Bounds(ge=1e-3, le=LARGEST)
+CAPACITY = Bounds(ge=LEAST_CAPACITY_J, le=LARGEST)
 """Battery capacity of a device, J."""
 
 

@@ -8,6 +8,9 @@ DEVICE_TYPES: tuple[str, ...] = ("Raspberry Pi 4B", "Raspberry Pi 3B", "Firefly"
 TASKS: tuple[str, ...] = ("HAAR", "MMOD", "DNN", "Dlib", "YOLOv3")
 """Computer-vision tasks; an int ``task`` indexes this tuple and the rows of the tables below."""
 
+UNLISTED = -1
+"""``device_type`` and ``task`` of hardware that the tables do not list."""
+
 STANDBY_POWER_W = np.array([2.65, 1.69, 4.87, 2.82, 1.88], np.float32)
 """Table 1: power drawn at all times, W, ``[types]``."""
 

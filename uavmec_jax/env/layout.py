@@ -137,8 +137,8 @@ def fleet_of(params: Params, layout: Layout) -> Fleet:
 
 
 DEVICE_BOUNDS = {
-    "device_type": Bounds(ge=0, le=len(hardware.DEVICE_TYPES) - 1, whole=True),
-    "task": Bounds(ge=0, le=len(hardware.TASKS) - 1, whole=True),
+    "device_type": Bounds(ge=hardware.UNLISTED, le=len(hardware.DEVICE_TYPES) - 1, whole=True),
+    "task": Bounds(ge=hardware.UNLISTED, le=len(hardware.TASKS) - 1, whole=True),
     "capacity": CAPACITY,
     "standby_power": Bounds(ge=0, le=LARGEST),
     "active_power": Bounds(ge=0, le=LARGEST),
@@ -162,9 +162,16 @@ def make_layout(
     """
     chex.assert_shape([device_type, task, capacity, has_power, has_comms], (position.shape[0],))
     chex.assert_shape(position, (None, 2))
-    given = {"device_type": device_type, "task": task, "capacity": capacity}
-    checks = [Check(name, value, DEVICE_BOUNDS[name], ("device",)) for name, value in given.items()]
-    check_ranges([Check("position", position, POSITION, ("device", "")), *checks])
+    listed = {"device_type": (device_type, hardware.DEVICE_TYPES), "task": (task, hardware.TASKS)}
+    checks = [
+        Check(name, value, Bounds(ge=0, le=len(table) - 1, whole=True), ("device",))
+        for name, (value, table) in listed.items()
+    ]
+    checks += [
+        Check("position", position, POSITION, ("device", "")),
+        Check("capacity", capacity, CAPACITY, ("device",)),
+    ]
+    check_ranges(checks)
     check_bool("has_power", has_power)
     check_bool("has_comms", has_comms)
     return Layout(

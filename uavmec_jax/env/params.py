@@ -9,23 +9,24 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from uavmec_jax.env.checks import CAPACITY, LARGEST, POSITION, Bounds, Check, check_range, check_ranges, is_traced
+from uavmec_jax.env.checks import (
+    CAPACITY,
+    LARGEST,
+    MAX_LENGTH_M,
+    SMALLEST,
+    Bounds,
+    Check,
+    check_range,
+    check_ranges,
+    is_traced,
+)
 from uavmec_jax.env.types import Range, Scalar
 from uavmec_jax.errors import ArgumentError
 
 MAX_DEVICES = 1000
 """Largest number of devices in a scenario."""
 
-LEAST, MOST = 1e-6, 1e12
-"""Bounds of quantities in SI units: far beyond any device or UAV, and products of a few of them are still float32."""
-
-LEAST_CAPACITY_J = 1e-3
-"""Smallest capacity of a device's battery."""
-
-MAX_LENGTH_M = 1e7
-"""Largest side of a region, altitude and signal range, m: beyond it, squares of distances lose their metres in float32."""
-
-_POSITIVE, _NOT_NEGATIVE = {"ge": LEAST, "le": MOST}, {"ge": 0, "le": MOST}
+_POSITIVE, _NOT_NEGATIVE = {"ge": SMALLEST, "le": LARGEST}, {"ge": 0, "le": LARGEST}
 
 ENDS = ("first_failure", "horizon")
 """What ends an episode. ``first_failure``: an empty battery, expired data or the UAVs' batteries, as in the paper.
@@ -44,7 +45,7 @@ class Params:
     uav_speed_m_s: Scalar = struct.field(default=5.0, metadata=_POSITIVE)
     uav_flying_power_w: Scalar = struct.field(default=150.0, metadata=_NOT_NEGATIVE)
     uav_hovering_power_w: Scalar = struct.field(default=80.0, metadata=_POSITIVE)
-    uav_signal_range_m: Scalar = struct.field(default=65.0, metadata={"ge": LEAST, "le": MAX_LENGTH_M})
+    uav_signal_range_m: Scalar = struct.field(default=65.0, metadata={"ge": SMALLEST, "le": MAX_LENGTH_M})
     """Largest slant distance, which includes the altitude, at which a device is served."""
     uav_altitude_m: Scalar = struct.field(default=10.0, metadata={"ge": 0, "le": MAX_LENGTH_M})
     uav_battery_j: Scalar = struct.field(default=1_600_000.0, metadata=_POSITIVE)
@@ -63,7 +64,7 @@ class Params:
     region_m: Range = (800.0, 800.0)
     result_message_bytes: Scalar = struct.field(default=1000.0, metadata=_NOT_NEGATIVE)
 
-    uplink_rate_bit_s: Scalar = struct.field(default=math.inf, metadata={"ge": LEAST})
+    uplink_rate_bit_s: Scalar = struct.field(default=math.inf, metadata={"ge": SMALLEST})
     """Rate at which connected devices that are not served send their results (not in the paper)."""
     flight_power_adds_to_hover: Scalar = False
     """Whether a slot of length T costs the UAV ``fly * t_fly + hover * T``, not ``fly * t_fly + hover * (T - t_fly)``."""
@@ -101,7 +102,7 @@ _BOUNDS = {
     field.name: Bounds.of(field, LARGEST) for field in dataclasses.fields(Params) if field.name not in _STATIC
 } | {
     "device_battery_range_j": CAPACITY,
-    "region_m": Bounds(gt=0, le=POSITION.le),
+    "region_m": Bounds(gt=0, le=MAX_LENGTH_M),
 }
 _RISING = ("device_battery_range_j", "task_volume_range_bytes")
 

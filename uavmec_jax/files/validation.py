@@ -180,7 +180,8 @@ def _in_words(location: list[Any], model: type[BaseModel], data: Any) -> str:
     words = ""
     for depth, part in enumerate(location):
         if not isinstance(part, int):
-            words += f".{part}" if words and not words.endswith(": ") else str(part)
+            inside = ": " if depth and isinstance(location[depth - 1], int) else "."
+            words += f"{inside}{part}" if words and not words.endswith(": ") else str(part)
         elif _fields_at(model, location[:depth]):  # of a list of tables
             words += f" {part + 1}{_name_at(data, location[: depth + 1])}: "
         else:

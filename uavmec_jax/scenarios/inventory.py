@@ -24,9 +24,6 @@ from uavmec_jax.files.validation import suggest
 from uavmec_jax.scenarios.region import Positions
 from uavmec_jax.scenarios.schema import DepotSettings, Device, ScenarioFile, label
 
-UNLISTED = -1
-"""``device_type`` and ``task`` of hardware that the paper's tables do not list."""
-
 _HARDWARE_FIELDS = ("standby_power_w", "active_power_w", "processing_rate_bytes_s")
 
 
@@ -177,7 +174,7 @@ def place_at(position: Float[np.ndarray, "2"], places: Float[np.ndarray, "m 2"],
 
 def _index(name: str | None, names: tuple[str, ...]) -> int:
     """Return the index of a name in the paper's tables."""
-    return names.index(name) if name in names else UNLISTED
+    return names.index(name) if name in names else hardware.UNLISTED
 
 
 def _hardware(number: int, device: Device) -> tuple[float, float, float]:

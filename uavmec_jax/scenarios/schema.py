@@ -5,19 +5,14 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
+from uavmec_jax.env.checks import LEAST_CAPACITY_J, MAX_LENGTH_M
 from uavmec_jax.env.fleet import DepotKind
 from uavmec_jax.files.validation import PrintableName, PrintableText, StrictModel, from_array, usual_size
 from uavmec_jax.scenarios.settings import ParamsSettings
 
-MAX_POSITION_M = 1e7
-"""Largest size of a coordinate, m from the origin."""
-
-MIN_CAPACITY_J = 1e-3
-"""Smallest battery capacity of a device, J."""
-
 _Power = Annotated[float, Field(ge=0), usual_size]
 _Positive = Annotated[float, Field(gt=0), usual_size]
-Metres = Annotated[float, Field(ge=-MAX_POSITION_M, le=MAX_POSITION_M)]
+Metres = Annotated[float, Field(ge=-MAX_LENGTH_M, le=MAX_LENGTH_M)]
 """A coordinate, m from the origin."""
 
 
@@ -68,7 +63,7 @@ class Device(Located):
     standby_power_w: _Power | None = None
     active_power_w: _Power | None = None
     processing_rate_bytes_s: _Positive | None = None
-    capacity_j: Annotated[float, Field(ge=MIN_CAPACITY_J), usual_size]
+    capacity_j: Annotated[float, Field(ge=LEAST_CAPACITY_J), usual_size]
     power: bool = False
     comms: bool = False
     priority: Annotated[float, Field(ge=0), usual_size] | None = None

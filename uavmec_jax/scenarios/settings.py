@@ -2,7 +2,8 @@
 
 from typing import Any
 
-from uavmec_jax.env.params import LEAST, LEAST_CAPACITY_J, MAX_LENGTH_M, MOST, Params
+from uavmec_jax.env.checks import LARGEST, LEAST_CAPACITY_J, MAX_LENGTH_M, SMALLEST
+from uavmec_jax.env.params import Params
 from uavmec_jax.files.validation import model_from_dataclasses
 
 ParamsSettings: Any = model_from_dataclasses("ParamsSettings", Params)
@@ -23,11 +24,11 @@ def check_ranges(settings: Any, where: str) -> None:
     Raises:
         ValueError: one line that names the parameter.
     """
-    for name, least in (("device_battery_range_j", LEAST_CAPACITY_J), ("task_volume_range_bytes", LEAST)):
+    for name, least in (("device_battery_range_j", LEAST_CAPACITY_J), ("task_volume_range_bytes", SMALLEST)):
         low, high = getattr(settings, name)
         if not 0 < low <= high:
             raise ValueError(f"{where}{name} is {[low, high]}; give [low, high] with 0 < low <= high")
-        if not least <= low <= high <= MOST:
-            raise ValueError(f"{where}{name} is {[low, high]}; give numbers from {least:g} to {MOST:g}")
+        if not least <= low <= high <= LARGEST:
+            raise ValueError(f"{where}{name} is {[low, high]}; give numbers from {least:g} to {LARGEST:g}")
     if not all(side <= MAX_LENGTH_M for side in settings.region_m):
         raise ValueError(f"{where}region_m is {list(settings.region_m)}; give sides of at most {MAX_LENGTH_M:g} m")

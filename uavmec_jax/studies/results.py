@@ -1,6 +1,5 @@
 """Results of a run: the tidy table, curves, evaluation and weights, and their files."""
 
-import hashlib
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,7 +12,9 @@ import pandas as pd
 from flax import traverse_util
 from jaxtyping import Float
 
+from uavmec_jax.errors import StudyError
 from uavmec_jax.files.locations import make_folder, reached
+from uavmec_jax.files.reading import digest_of
 from uavmec_jax.files.writing import write_arrays, write_text
 from uavmec_jax.scenarios.policy_files import WEIGHTS, PolicyCollection, write_policies
 from uavmec_jax.scenarios.settings import unused_params
@@ -243,7 +244,7 @@ class Results:
         if self.weights:
             write_policies(directory / WEIGHTS, self._collection())
         written = [directory / name for name in (STUDY, AGENTS, CURVES, EVALUATION, WEIGHTS)]
-        digests = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in written if file.exists()}
+        digests = {file.name: digest_of(file, StudyError) for file in written if file.exists()}
         write_text(directory / RUN, json.dumps(self.run | {"sha256": digests}, indent=1) + "\n")
 
     def _collection(self) -> PolicyCollection:
