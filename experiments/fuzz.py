@@ -34,8 +34,8 @@ def table(report: dict) -> str:
         for name, row in (*report["kinds"].items(), ("**all**", report["all"]))
     ]
     failures = [
-        f"- {row['what']}, {row['count']} times, first in `{row['first']}`: `{row['where']}`: "
-        + one_line(row["message"][:200]).replace("`", "'").encode("ascii", "backslashreplace").decode()
+        f"- {row['what']}, {row['count']} times, first in `{row['first']}`: `{one_line(row['where'])}`: "
+        + one_line(row["message"][:200]).replace("`", "'")
         for row in report["failures"]
     ]
     found = "\n".join(failures) or "None."

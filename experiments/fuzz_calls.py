@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from fuzz_values import Range, hostile
+from fuzz_values import MANY, Range, hostile
 
 import uavmec_jax as um
 from uavmec_jax.env.params import Params
@@ -29,6 +29,7 @@ class Call:
         arguments: makes valid arguments by name; made once.
         ranges: argument -> the least and largest number that it may be.
         fixed: arguments that stay valid.
+        valid: whether the arguments are accepted; there is no run to load.
     """
 
     weight: int
@@ -36,6 +37,7 @@ class Call:
     arguments: Callable[[], dict[str, Any]]
     ranges: Mapping[str, Range] = field(default_factory=dict)
     fixed: tuple[str, ...] = ()
+    valid: bool = True
 
 
 @dataclass(frozen=True)
@@ -63,9 +65,8 @@ def make_call(name: str, rng: Random) -> HostileCall:
         arguments[key], place, reason = hostile(rng, arguments[key], key, call.ranges.get(key))
         places.append(place)
         reasons.append(reason)
-    text = "; ".join(places)
     why = next((reason for reason in reasons if reason), "")
-    return HostileCall(lambda: call.function(**arguments), text, f"{name}: {why}" if why else "")
+    return HostileCall(lambda: call.function(**arguments), "; ".join(places), f"{name}: {why}" if why else "")
 
 
 @cache
@@ -196,13 +197,12 @@ def _with_horizon() -> Params:
     return um.Params(n_devices=_DEVICES, end="horizon", horizon_s=3000.0)
 
 
-_MANY = (1, 10**6)
 _ACTION: dict[str, Range] = {"action": (0, _DEVICES - 1)}
 _COUNTS: dict[str, Range] = {"n_powered": (0, _DEVICES), "n_connected": (0, _DEVICES)}
 _VOLUMES: dict[str, Range] = {"volumes": (0, 1e30)}
 _SCENARIO: dict[str, Range] = {"powered": (0, 12), "connected": (0, 12), "seed": (0, 2**32), "uavs": (1, 100)}
 _TABLES: dict[str, Range] = {"device_type": (0, 5), "task": (0, 4), "capacity": (1e-30, 1e30)}
-_RAY: dict[str, Range] = {"cpus_per_shard": _MANY, "gpus_per_shard": (0, 10**6), "retries": (0, 10**9)}
+_RAY: dict[str, Range] = {"cpus_per_shard": MANY, "gpus_per_shard": (0, 10**6), "retries": (0, 10**9)}
 _RUN: dict[str, Range] = {"checkpoint_every_s": (0, math.inf), "checkpoint_share": (0, 1)}
 _LAYOUT = ("position", "device_type", "task", "capacity", "has_power", "has_comms")
 _STUDY = {"steps": 100, "axes.seeds": 2, "dqn.gamma": 0.9, "params.uav_speed_m_s": 4.0, "evaluation.draws": 3}
@@ -217,7 +217,7 @@ CALLS: dict[str, Call] = {
     "observe": _call(2, um.env.observe, "params layout state"),
     "observe_devices": _call(2, um.planning.observe_devices, "params layout state"),
     "draw_volumes": _call(2, um.env.draw_volumes, "params", uniform=lambda: jnp.full(_DEVICES, 0.5)),
-    "volume_table": _call(2, um.env.volume_table, "params key", {"slots": _MANY}, n_devices=3, slots=4),
+    "volume_table": _call(2, um.env.volume_table, "params key", {"slots": MANY}, n_devices=3, slots=4),
     "make_reward": _call(
         4, um.make_reward, reward={"U": 1.0, "log A": 1.0}, guard="clamp", traffic_bonus=1.0, per_slot=0.0
     ),
@@ -230,41 +230,43 @@ CALLS: dict[str, Call] = {
     "advance": _call(2, um.env.advance, "scenario state action volumes", _ACTION | _VOLUMES),
     "UavMecEnv.step": _call(3, um.UavMecEnv().step, "key state action", _ACTION, params=lambda: _scenario()),
     "UavMecGymEnv.step": _call(2, _gym_step, "action", _ACTION),
-    "rollout": _call(2, um.rollout, "policy params layout key", fixed="policy"),
-    "rollouts": _call(2, um.rollouts, "policy params layout keys", fixed="policy"),
-    "rollout_from": _call(2, um.env.rollout_from, "policy params layout state key", fixed="policy"),
-    "rollout_draws": _call(1, um.env.rollout_draws, "policy scenario keys", fixed="policy"),
-    "returns": _call(1, um.env.returns, "policy scenario keys", fixed="policy"),
-    "trace": _call(1, _trace, "", {"slots": _MANY}, slots=3),
+    "rollout": _call(2, um.rollout, "policy params layout key", None, "policy"),
+    "rollouts": _call(2, um.rollouts, "policy params layout keys", None, "policy"),
+    "rollout_from": _call(2, um.env.rollout_from, "policy params layout state key", None, "policy"),
+    "rollout_draws": _call(1, um.env.rollout_draws, "policy scenario keys", None, "policy"),
+    "returns": _call(1, um.env.returns, "policy scenario keys", None, "policy"),
+    "trace": _call(1, _trace, "", {"slots": MANY}, slots=3),
     "measure": _call(
         1, um.env.measure, "params layout", None, "trace", trace=lambda: _trace(3), weight=lambda: jnp.ones(3)
     ),
     "earliest_deadline": _call(2, um.planning.earliest_deadline, "params layout state key"),
     "oldest-first": _call(1, um.planning.HEURISTICS["oldest-first"], "params layout state key"),
-    "planned_slots": _call(1, um.planning.planned_slots, "params", layouts=lambda: _batch(_layout())),
+    "planned_slots": _call(
+        1, um.planning.planned_slots, params=lambda: _batch(_params()), layouts=lambda: _batch(_layout())
+    ),
     "upper_bound": _call(
         5, um.planning.upper_bound, "params layout", {"reached": (0, 10**6)}, volumes=_table, reached=1
     ),
     "service_bound": _call(2, um.planning.service_bound, "layout", params=lambda: _with_horizon()),
     "beam_search": _call(2, um.planning.beam_search, "params layout", {"width": (1, 10**5)}, volumes=_table, width=2),
-    "rollout_planner": _call(1, um.planning.rollout_planner, "", {"samples": _MANY}, samples=2),
+    "rollout_planner": _call(1, um.planning.rollout_planner, "", {"samples": MANY}, samples=2),
     "make_forecast": _call(
-        2, um.planning.make_forecast, "policy params layout state key", {"samples": _MANY}, "policy", samples=2
+        2, um.planning.make_forecast, "policy params layout state key", {"samples": MANY}, "policy", samples=2
     ),
-    "advise": _call(1, um.planning.advise, "policy params layout state key", {"samples": _MANY}, "policy", samples=2),
+    "advise": _call(1, um.planning.advise, "policy params layout state key", {"samples": MANY}, "policy", samples=2),
     "make_plan": _call(
-        1, um.planning.make_plan, "params layout draws", {"width": _MANY, "samples": _MANY}, width=2, samples=1
+        1, um.planning.make_plan, "params layout draws", {"width": MANY, "samples": MANY}, width=2, samples=1
     ),
     "train": _call(
         1,
         _train,
         "key",
-        {"steps": _MANY},
+        {"steps": MANY},
         steps=20,
         hyper={"learning_rate": 1e-3, "gamma": 0.9},
         settings={"hidden": (4,)},
     ),
-    "Validation": _call(1, um.training.Validation, "", {"every": _MANY, "draws": _MANY}, every=100, draws=2, chunks=2),
+    "Validation": _call(1, um.training.Validation, "", {"every": MANY, "draws": MANY}, every=100, draws=2, chunks=2),
     "RunOptions": _call(
         2, um.runs.RunOptions, "", _RUN, checkpoint="full", checkpoint_every_s=1.0, checkpoint_share=0.1
     ),
@@ -276,7 +278,7 @@ CALLS: dict[str, Call] = {
     "name_scenario": _call(2, um.scenarios.name_scenario, "params layout", name="x", device_names=["a", "b", "c"]),
     "layout_for_seed": _call(3, um.scenarios.layout_for_seed, "params", _COUNTS, seed=1, n_powered=1, n_connected=1),
     "held_out_draws": _call(
-        2, um.scenarios.held_out_draws, "", {"draws": _MANY}, seed=1, powered=8, connected=8, draws=2
+        2, um.scenarios.held_out_draws, "", {"draws": MANY}, seed=1, powered=8, connected=8, draws=2
     ),
     "on_place": _call(2, _place, "", {"scale_to_m": (1e-30, math.inf)}, moving=False, scale_to_m=800.0),
     "scenario_text": _call(1, um.scenarios.scenario_text, scenario=lambda: _named(), suffix=".toml"),
@@ -285,11 +287,11 @@ CALLS: dict[str, Call] = {
     "load_study": _call(4, partial(um.load_study, "table5"), overrides=_STUDY),
     "load_space": _call(2, partial(um.search.load_space, "dqn"), overrides={"trials": 4, "batch": 2, "seed": 1}),
     "load_place": _call(2, partial(um.traffic.load_place, "albany"), overrides=_PLACE),
-    "plan_run": _call(2, _plan, "", {"shard_size": _MANY}, shard_size=2),
-    "simulate": _call(3, _simulate, "", {"speed": (1e-30, 1e30), "devices": _MANY}, speed=1e4, devices=2),
-    "load_results": _call(1, um.load_results, directory="nowhere"),
-    "load_weights": _call(1, um.studies.load_weights, directory="nowhere", which="best"),
-    "run_status": _call(1, um.runs.run_status, directory="nowhere"),
+    "plan_run": _call(2, _plan, "", {"shard_size": MANY}, shard_size=2),
+    "simulate": _call(3, _simulate, "", {"speed": (1e-30, 1e30), "devices": MANY}, speed=1e4, devices=2),
+    "load_results": Call(1, um.load_results, lambda: {"directory": "nowhere"}, valid=False),
+    "load_weights": Call(1, um.studies.load_weights, lambda: {"directory": "nowhere", "which": "last"}, valid=False),
+    "run_status": Call(1, um.runs.run_status, lambda: {"directory": "nowhere"}, valid=False),
     "load_evacuation": _call(1, um.traffic.load_evacuation, source="albany"),
     "evaluate_policy": _call(
         1, um.studies.evaluate_policy, "policy draws", None, "policy scenario", name="x", scenario=lambda: _named()

@@ -20,6 +20,9 @@ _TYPES = ("float64", "float32", "int32", "int8", "bool", "complex64", "U3", "obj
 
 Range = tuple[float, float]
 
+MANY: Range = (1, 10**6)
+"""Range of numbers of things that are computed; more of them are not wrong, but take too long."""
+
 
 def hostile(rng: Random, old: Any, name: str, allowed: Range | None) -> tuple[Any, str, str]:
     """Return a hostile value in place of a valid one, what it is, and why it must be refused."""
@@ -40,6 +43,8 @@ def hostile(rng: Random, old: Any, name: str, allowed: Range | None) -> tuple[An
         return _hostile_array(rng, old, name, allowed)
     if isinstance(old, bool | int | float) and rng.random() < 0.8:
         number = rng.choice(_NUMBERS if rng.random() < 0.5 else _SMALL)
+        if allowed == MANY and math.isfinite(number) and number > MANY[1]:
+            number = -1
         return number, f"{name} = {number!r}", _reason(number, name, allowed)
     wrong = rng.choice(
         (None, "x", "", [], {}, (), object, b"x", 1j, [1, 2], np.zeros((2, 0)), np.nan, rng.choice(WORDS))
@@ -70,7 +75,8 @@ def _hostile_array(rng: Random, old: Any, name: str, allowed: Range | None) -> t
             array.reshape(-1)[rng.randrange(array.size)] = number
         given = array if array.dtype == object or rng.random() < 0.5 else jnp.asarray(array)
         changed = float(np.asarray(given, float).reshape(-1)[0]) if array.size == 1 else float(number)
-        return given, f"{name} has {number!r} ({given.dtype})", _reason(changed, name, allowed)
+        reason = "" if old.dtype == bool else _reason(changed, name, allowed)
+        return given, f"{name} has {number!r} ({given.dtype})", reason
     if what < 0.8:
         kind = rng.choice(_TYPES)
         return array.astype(kind), f"{name} is {kind}", ""

@@ -109,7 +109,8 @@ class Worker:
                         run_command([*command.split(), *line])
         elif name.startswith(CALL):
             call = CALLS[name.removeprefix(CALL)]
-            call.function(**call.arguments())
+            if call.valid:
+                call.function(**call.arguments())
         else:
             kind = self._kinds[name]
             for seed in kind.seeds:
