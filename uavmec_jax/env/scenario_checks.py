@@ -12,7 +12,7 @@ def check_layout(layout: Layout, params: Params | None = None, name: str = "layo
 
     Args:
         layout: the devices, the UAVs and the depots.
-        params: if given, the layout should have their number of devices.
+        params: if given, the layout should have their number of devices; one with padding may have more entries.
         name: of the layout in messages.
 
     Raises:
@@ -20,7 +20,8 @@ def check_layout(layout: Layout, params: Params | None = None, name: str = "layo
             :func:`um.debug_checks`.
     """
     n = layout.n_devices
-    if params is not None and n != params.n_devices:
+    padded = layout.present is not None
+    if params is not None and n != params.n_devices and not (padded and n > params.n_devices):
         raise ArgumentError(f"{name} has {n} devices; it should have params.n_devices = {params.n_devices} of them")
     check_shape(f"{name}.position", layout.position, (n, 2), "x and y of each device")
     checks = [Check(f"{name}.position", layout.position, POSITION, ("device", ""))]
