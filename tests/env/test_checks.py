@@ -121,7 +121,7 @@ LAYOUTS = {
     ),
     "type": (
         layout(device_type=(1, 5)),
-        r"layout\.device_type of device 2 is 5; it should be a whole number from 0 to 4",
+        r"layout\.device_type of device 2 is 5; it should be a whole number from -1 to 4",
     ),
     "numbers as masks": (
         LAYOUT.replace(has_power=jnp.ones(12)),
