@@ -200,7 +200,7 @@ def _batch_hyper(algorithm: str, registered: RegisteredAlgorithm, hyper: Mapping
             raise StudyError(f"hyper has {given!r}, which is not a hyperparameter of {algorithm}; {hint}")
     leaves = {}
     for field in dataclasses.fields(registered.hyper):
-        name: str = field.name
+        name = field.name
         default: Any = field.default
         bounds = Bounds(ge=0, le=1) if isinstance(default, bool) else Bounds.of(field)
         check_ranges([Check(f"hyper.{name}", hyper.get(name, default), bounds, ("agent",))])
