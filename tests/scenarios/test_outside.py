@@ -116,8 +116,8 @@ BAD_TOML = {
         f"{DEVICE}[[depot]]\nx_m = 1.0\ny_m = 1.0\npads = 1e300\n",
         "pads is 1e+300; it should be at most 1e+12",
     ),
-    "no name": (DEVICE.replace('"a"', '""'), "name is ''; String should have at least 1 character"),
-    "long name": (DEVICE.replace('"a"', f'"{"a" * 81}"'), "String should have at most 80 characters"),
+    "no name": (DEVICE.replace('"a"', '""'), "name is ''; should have at least 1 character"),
+    "long name": (DEVICE.replace('"a"', f'"{"a" * 81}"'), "should have at most 80 characters"),
     "terminal's name": (
         DEVICE.replace('"a"', '"\\u001b[2J"'),
         "it should be one line of characters that can be printed",

@@ -1,15 +1,10 @@
 """Checks of whole layouts, with their UAVs and depots, and of scenarios; see :mod:`uavmec_jax.env.checks`."""
 
-from dataclasses import replace
-
 from uavmec_jax.env.checks import LARGEST, POSITION, Bounds, Check, check_bool, check_ranges, check_shape
 from uavmec_jax.env.fleet import DEPOT_BOUNDS, FLEET_BOUNDS, DepotKind, Depots, Fleet
 from uavmec_jax.env.layout import DEVICE_BOUNDS, Layout, Traffic
 from uavmec_jax.env.params import Params, check_params
 from uavmec_jax.errors import ArgumentError
-
-_MAYBE_OTHER = {name: replace(DEVICE_BOUNDS[name], ge=-1) for name in ("device_type", "task")}
-"""Devices and tasks that are in none of the paper's tables have the number -1, and powers and a rate of their own."""
 
 
 def check_layout(layout: Layout, params: Params | None = None, name: str = "layout") -> None:
@@ -30,7 +25,7 @@ def check_layout(layout: Layout, params: Params | None = None, name: str = "layo
         raise ArgumentError(f"{name} has {n} devices; it should have params.n_devices = {params.n_devices} of them")
     check_shape(f"{name}.position", layout.position, (n, 2), "x and y of each device")
     checks = [Check(f"{name}.position", layout.position, POSITION, ("device", ""))]
-    for field, bounds in (DEVICE_BOUNDS | _MAYBE_OTHER).items():
+    for field, bounds in DEVICE_BOUNDS.items():
         value = getattr(layout, field)
         check_shape(f"{name}.{field}", value, (n,), "one per device")
         checks.append(Check(f"{name}.{field}", value, bounds, ("device",)))

@@ -11,7 +11,7 @@ from pydantic import Field
 from uavmec_jax.env.dynamics import State, slots_to_expiry
 from uavmec_jax.errors import StateError
 from uavmec_jax.files.parsing import read_json_object
-from uavmec_jax.files.validation import from_array, usual_size, validated
+from uavmec_jax.files.validation import LARGEST, from_array, validated
 from uavmec_jax.scenarios.named_scenario import NamedScenario
 from uavmec_jax.scenarios.uav_states import (
     Number,
@@ -42,7 +42,7 @@ class StateFile(UavStates):
     ``horizon``."""
     slot: Annotated[int, Field(ge=0, le=_MAX_SLOTS)] = 0
     """Number of completed slots."""
-    elapsed_s: Annotated[float, Field(ge=0), usual_size] = 0.0
+    elapsed_s: Annotated[float, Field(ge=0, le=LARGEST)] = 0.0
     """Duration of the completed slots, s."""
 
 
