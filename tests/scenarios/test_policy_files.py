@@ -86,7 +86,7 @@ def test_the_good_file_and_the_shipped_policy_are_read_to_the_bit(tmp_path):
 
 
 BAD_HEADERS = {
-    "no settings": ({"settings": None}, "settings is missing"),
+    "no settings": ({"settings": None}, "its header has no settings"),
     "empty settings": ({"settings": {}}, "settings is {}"),
     "settings as a list": ({"settings": [1]}, "settings is [1]; it should be a valid dictionary"),
     "unknown algorithm": ({"settings.sarsa": {}}, "settings.sarsa is not an algorithm of this version; known: dqn"),

@@ -14,6 +14,7 @@ from uavmec_jax.reporting import canvas, figures
 from uavmec_jax.reporting.compare import comparison
 from uavmec_jax.reporting.summary import summary
 from uavmec_jax.reporting.tables import gap_percent, tables
+from uavmec_jax.runs.run_plan import label_of, plan_run
 from uavmec_jax.studies import planner_evaluation
 from uavmec_jax.studies.compare import Side, mostly_censored, overall, pair
 from uavmec_jax.studies.evaluation_result import EvaluationResult, PlannerResult
@@ -85,7 +86,7 @@ def made_up(text=CELLS):
         table = ids.assign(**columns).iloc[rows].reset_index(drop=True)
         arrays = {name: array[rows] for name, array in evaluation.items()}
         shards.append(ShardResult("none", table, {}, arrays, {}, {"wall": 1.0}, 0))
-    return Results.of(study, {"schema": 3}, shards, len(ids))
+    return Results.of(study, label_of(study, plan_run(study), "a test"), shards, len(ids))
 
 
 @pytest.fixture(scope="module")

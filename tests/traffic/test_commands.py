@@ -80,7 +80,7 @@ BAD = [
     ),
     (["build", "albany", "--devices", "one.toml"], "one.toml: holds 1 [[device]] tables; give 2 to 1000, or none"),
     (["build", "albany", "--out", "folder.npz"], "--out folder.npz: is not a regular file, and is not replaced"),
-    (["build", "albany", "--out", "n" * 300 + "/x.npz"], "--out nnn"),
+    (["build", "albany", "--out", "n" * 300 + "/x.npz"], "--out is 'nnn"),
     (["build", "--osm", "x.osm", "--devices", "none.toml"], "none.toml: cannot be read: No such file"),
     (["build", "albania"], "albania: neither a file nor a shipped place"),
     (["build", "x.sumocfg"], "x.sumocfg: not TOML"),

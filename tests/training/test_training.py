@@ -98,7 +98,7 @@ def test_restored_training_continues_to_the_same_result(trainer, population, who
     restored.restore(3, saved)
     list(restored.run())
     assert_same_result(restored.result(4), whole)
-    with pytest.raises(ValueError, match=r"curves/episodes has 3 entries; it should have 2"):
+    with pytest.raises(ValueError, match=r"curves/episode_slots is missing, or not 2 x 4 numbers"):
         trainer.start(*take(population, slice(4))).restore(2, saved | {"curves/episode_slots": np.zeros((2, 4))})
 
 

@@ -69,6 +69,8 @@ def check_header(path: Path, header: Mapping[str, Any]) -> None:
     Raises:
         PolicyError: a value is missing, unknown or not what it should be; one line.
     """
+    if missing := {"settings", "n_devices", "agents"} - set(header):
+        raise PolicyError(f"{path}: is not a file of policies: its header has no {', '.join(sorted(missing))}")
     checked = validated(PolicyHeader, dict(header), path, PolicyError)
     for name, settings in checked.settings.items():
         if name not in ALGORITHMS:
