@@ -118,6 +118,7 @@ def test_a_command_in_the_folder_of_a_run_is_told_who_works_there(tmp_path, seco
         run.communicate()
 
 
+@pytest.mark.slow
 def test_a_refused_plan_leaves_nothing(tmp_path):
     (tmp_path / "a.csv").write_text("name\nno position\n")
     code, errors = ended(start("plan", "a.csv", cwd=tmp_path))
@@ -125,6 +126,7 @@ def test_a_refused_plan_leaves_nothing(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["a.csv"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["run_plan.json", "run.json", "search.json", "trials.db", "tour.json"])
 def test_a_plan_overwrites_nothing_of_another_kind(tmp_path, kind):
     (tmp_path / "x").mkdir()
