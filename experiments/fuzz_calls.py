@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from fuzz_values import MANY, Range, hostile
+from fuzz_values import MANY, OTHER_TYPE, Range, hostile
 
 import uavmec_jax as um
 from uavmec_jax.env.params import Params
@@ -30,6 +30,8 @@ class Call:
         ranges: argument -> the least and largest number that it may be.
         fixed: arguments that stay valid.
         valid: whether the arguments are accepted; there is no run to load.
+        checks: whether the function checks what it is given (docs/api.md, "What calls check"); the others are called in
+            programs, or read a part of it.
     """
 
     weight: int
@@ -38,6 +40,7 @@ class Call:
     ranges: Mapping[str, Range] = field(default_factory=dict)
     fixed: tuple[str, ...] = ()
     valid: bool = True
+    checks: bool = True
 
 
 @dataclass(frozen=True)
@@ -48,11 +51,15 @@ class HostileCall:
         make: makes it.
         text: the values that are hostile, in words.
         must_refuse: why it must not be accepted, empty if it may.
+        other_type: whether a value is of another type or shape, which Python and JAX may refuse in words of their own.
+        finite: whether what it returns must be finite: the function checks all of its arguments.
     """
 
     make: Callable[[], Any]
     text: str
     must_refuse: str
+    other_type: bool = False
+    finite: bool = True
 
 
 def make_call(name: str, rng: Random) -> HostileCall:
@@ -64,9 +71,11 @@ def make_call(name: str, rng: Random) -> HostileCall:
         key = rng.choice([key for key in arguments if key not in call.fixed])
         arguments[key], place, reason = hostile(rng, arguments[key], key, call.ranges.get(key))
         places.append(place)
-        reasons.append(reason)
-    why = next((reason for reason in reasons if reason), "")
-    return HostileCall(lambda: call.function(**arguments), "; ".join(places), f"{name}: {why}" if why else "")
+        reasons.append(reason if reason == OTHER_TYPE or call.checks or key in call.ranges else "")
+    why = next((reason for reason in reasons if reason not in ("", OTHER_TYPE)), "")
+    must_refuse = f"{name}: {why}" if why and OTHER_TYPE not in reasons else ""
+    text = "; ".join(places)
+    return HostileCall(lambda: call.function(**arguments), text, must_refuse, OTHER_TYPE in reasons, finite=call.checks)
 
 
 @cache
@@ -129,7 +138,7 @@ def _call(
         made = {name: value() if isinstance(value, FunctionType) else value for name, value in values.items()}
         return {name: all_known[name] for name in known.split()} | made
 
-    return Call(weight, function, make, ranges or {}, tuple(fixed.split()))
+    return Call(weight, function, make, ranges or {}, tuple(fixed.split()), checks=function not in _UNCHECKED)
 
 
 def _table() -> Any:
@@ -197,6 +206,19 @@ def _with_horizon() -> Params:
     return um.Params(n_devices=_DEVICES, end="horizon", horizon_s=3000.0)
 
 
+_ENV = um.UavMecEnv()
+_UNCHECKED = (
+    *(
+        um.transition,
+        um.env.advance,
+        um.env.observe,
+        um.planning.observe_devices,
+        um.env.draw_volumes,
+        um.env.make_fleet,
+    ),
+    *(um.planning.earliest_deadline, um.planning.HEURISTICS["oldest-first"], um.planning.planned_slots),
+    *(um.env.pad_layout, um.env.measure, _ENV.step),
+)
 _ACTION: dict[str, Range] = {"action": (0, _DEVICES - 1)}
 _COUNTS: dict[str, Range] = {"n_powered": (0, _DEVICES), "n_connected": (0, _DEVICES)}
 _VOLUMES: dict[str, Range] = {"volumes": (0, 1e30)}
@@ -228,7 +250,7 @@ CALLS: dict[str, Call] = {
     "make_scenario": _call(2, um.make_scenario, "params layout reward"),
     "sample_scenario": _call(2, um.sample_scenario, "key", distribution=lambda: _distribution()),
     "advance": _call(2, um.env.advance, "scenario state action volumes", _ACTION | _VOLUMES),
-    "UavMecEnv.step": _call(3, um.UavMecEnv().step, "key state action", _ACTION, params=lambda: _scenario()),
+    "UavMecEnv.step": _call(3, _ENV.step, "key state action", _ACTION, params=lambda: _scenario()),
     "UavMecGymEnv.step": _call(2, _gym_step, "action", _ACTION),
     "rollout": _call(2, um.rollout, "policy params layout key", None, "policy"),
     "rollouts": _call(2, um.rollouts, "policy params layout keys", None, "policy"),

@@ -129,7 +129,9 @@ def file_kinds(corpus: Path) -> dict[str, Kind]:
         "run plan (JSON)": of_run(25, young, "run_plan.json", _sealed_plan, use_unfinished),
         "study of a run (TOML)": of_run(5, young, "study.toml", mutate_toml, use_unfinished),
         "progress of a shard (JSON)": of_run(5, young, "shards/*/progress-*.json", mutate_json, use_unfinished),
-        "result of a shard (npz)": of_run(20, young, shard, archive, use_shard, may_be_nan=True),
+        "result of a shard (npz)": of_run(
+            20, young, shard, archive, use_shard, may_be_nan=True, may_be_infinite=INFINITE | {"best_validation"}
+        ),
         "checkpoint (npz)": of_run(15, young, checkpoint, archive, make_restorer(young), may_be_nan=True, writes=True),
         "run.json": of_run(15, finished, "run.json", mutate_json, use_finished, may_be_nan=True),
         "agents.csv": of_run(20, finished, "agents.csv", mutate_csv, use_finished, may_be_nan=True, seal=_reseal),

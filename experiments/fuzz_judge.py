@@ -89,6 +89,18 @@ def alarm(seconds: float) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
+_OF_ANOTHER_TYPE = (
+    TypeError,
+    ValueError,
+    AttributeError,
+    AssertionError,
+    LookupError,
+    OverflowError,
+    NotImplementedError,
+)
+"""What Python, chex and JAX raise for an argument of another type or shape."""
+
+
 def judge(
     load: Callable[[], Any],
     folder: Path,
@@ -97,6 +109,8 @@ def judge(
     may_be_nan: bool = False,
     may_write: bool = False,
     must_refuse: str = "",
+    other_type: bool = False,
+    finite: bool = True,
     slow_s: float = SLOW_S,
     hang_s: float = HANG_S,
 ) -> Verdict:
@@ -109,12 +123,14 @@ def judge(
         may_be_nan: whether what is loaded may hold NaN, as results do for what was not evaluated.
         may_write: whether a refusal may change the folder.
         must_refuse: why the input must not be accepted, if it must not.
+        other_type: whether the input is of another type or shape, so that Python and JAX may refuse it in words of their own.
+        finite: whether what is loaded must be finite.
         slow_s, hang_s: seconds after which it is slow, and given up.
     """
     before, memory, started, worked = snapshot(folder), _reset_peak(), time.perf_counter(), time.process_time()
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always", RuntimeWarning)
-        verdict = _judge(load, may_be_infinite, may_be_nan, must_refuse, hang_s)
+        verdict = _judge(load, (may_be_infinite, may_be_nan) if finite else None, must_refuse, other_type, hang_s)
     seconds = min(time.perf_counter() - started, time.process_time() - worked)
     if not may_write and verdict.outcome == "refused" and (changed := _changed(before, snapshot(folder))):
         verdict = Verdict("failure", "written", verdict.where, f"{changed} (refused: {verdict.message})")
@@ -132,7 +148,11 @@ def judge(
 
 
 def _judge(
-    load: Callable[[], Any], may_be_infinite: frozenset[str], may_be_nan: bool, must_refuse: str, hang_s: float
+    load: Callable[[], Any],
+    finite_but: tuple[frozenset[str], bool] | None,
+    must_refuse: str,
+    other_type: bool,
+    hang_s: float,
 ) -> Verdict:
     try:
         with alarm(hang_s):
@@ -140,7 +160,7 @@ def _judge(
                 loaded = load()
             except ReachedError as reached:
                 loaded = reached.args
-            found = not_finite(loaded, may_be_infinite, may_be_nan)
+            found = not_finite(loaded, *finite_but) if finite_but else ""
     except HangError as error:
         return Verdict("failure", "hang", location(error.__traceback__), str(error))
     except Refused as refused:
@@ -150,6 +170,8 @@ def _judge(
     except KeyboardInterrupt:
         raise
     except BaseException as error:
+        if other_type and isinstance(error, _OF_ANOTHER_TYPE):
+            return Verdict("refused", where=location(error.__traceback__), message=type(error).__name__)
         try:
             text = f"{type(error).__name__}: {str(error)[:200]}"
         except Exception as unprintable:

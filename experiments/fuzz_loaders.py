@@ -34,7 +34,6 @@ from uavmec_jax.scenarios.state_files import load_state
 from uavmec_jax.search.search import run_search
 from uavmec_jax.search.space import baseline_settings, identity, load_space
 from uavmec_jax.studies.population import n_agents
-from uavmec_jax.studies.shard_result import ShardResult
 from uavmec_jax.studies.study import load_study, parse_study, study_toml
 from uavmec_jax.traffic.checked_xml import checked_copy
 from uavmec_jax.traffic.evacuation import load_evacuation
@@ -58,7 +57,7 @@ def use_space(folder: Path) -> Any:
 
 def use_scenario(folder: Path) -> Any:
     """Load a scenario or an inventory, and play a slot."""
-    path = next(path for path in folder.iterdir())
+    path = next(folder.iterdir(), folder / "missing.toml")
     named = load_scenario_file(path)
     scenario_text(named)
     return named, _one_slot(named.params, named.layout, named.state)
@@ -130,8 +129,10 @@ def use_unfinished(file: str, folder: Path) -> Any:
 
 
 def use_shard(file: str, folder: Path) -> Any:
-    """Load the result of a shard."""
-    return ShardResult.read(folder / file)
+    """Load the results of the shards of a run that are finished."""
+    assert (folder / file).parent.is_dir()
+    results = load_results(folder)
+    return results.agents, results.curves, results.evaluation
 
 
 def make_restorer(young: Path) -> Callable[[str, Path], Any]:

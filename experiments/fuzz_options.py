@@ -23,7 +23,7 @@ _HEAVY = (
     "uavmec_jax.planning.plan.make_plan",
     "uavmec_jax.scenarios.advice.advise_on",
     "uavmec_jax.studies.policy_evaluation.evaluate_policy",
-    "uavmec_jax.search.search.run_search",
+    "uavmec_jax.search.search.continue_search",
     "uavmec_jax.reporting.compare.overall",
     "uavmec_jax.traffic.build.build_evacuation",
     "uavmec_jax.training.environment_speed.environment_speed",

@@ -24,6 +24,10 @@ MANY: Range = (1, 10**6)
 """Range of numbers of things that are computed; more of them are not wrong, but take too long."""
 
 
+OTHER_TYPE = "of another type or shape"
+"""Reason of a value that is no number in a number's place: Python and JAX may refuse it in words of their own."""
+
+
 def hostile(rng: Random, old: Any, name: str, allowed: Range | None) -> tuple[Any, str, str]:
     """Return a hostile value in place of a valid one, what it is, and why it must be refused."""
     if dataclasses.is_dataclass(old) and not isinstance(old, type):
@@ -34,7 +38,7 @@ def hostile(rng: Random, old: Any, name: str, allowed: Range | None) -> tuple[An
             return dataclasses.replace(old, **{chosen.name: part}), f"{name}.{place}", reason
     if isinstance(old, dict) and rng.random() < 0.9:
         edited = edit(rng, _plain(old), 1)
-        return edited, f"{name} = {edited!r:.300}", ""
+        return edited, f"{name} = {edited!r:.300}", OTHER_TYPE
     if isinstance(old, tuple) and old and rng.random() < 0.8:
         at = rng.randrange(len(old))
         part, place, reason = hostile(rng, old[at], name, allowed)
@@ -49,7 +53,7 @@ def hostile(rng: Random, old: Any, name: str, allowed: Range | None) -> tuple[An
     wrong = rng.choice(
         (None, "x", "", [], {}, (), object, b"x", 1j, [1, 2], np.zeros((2, 0)), np.nan, rng.choice(WORDS))
     )
-    return wrong, f"{name} = {wrong!r:.100}", ""
+    return wrong, f"{name} = {wrong!r:.100}", OTHER_TYPE
 
 
 def _plain(data: Any) -> Any:
@@ -64,7 +68,7 @@ def _hostile_array(rng: Random, old: Any, name: str, allowed: Range | None) -> t
         wrong = rng.choice(
             (0, None, jnp.zeros(3), "x", np.zeros((2, 2), np.uint32), jnp.array([old, old]), old[..., None])
         )
-        return wrong, f"{name} = {str(wrong)[:60]}", ""
+        return wrong, f"{name} = {str(wrong)[:60]}", OTHER_TYPE
     array, what = np.array(old), rng.random()
     if what < 0.6 and array.size:
         number = rng.choice(_SMALL)
@@ -79,7 +83,7 @@ def _hostile_array(rng: Random, old: Any, name: str, allowed: Range | None) -> t
         return given, f"{name} has {number!r} ({given.dtype})", reason
     if what < 0.8:
         kind = rng.choice(_TYPES)
-        return array.astype(kind), f"{name} is {kind}", ""
+        return array.astype(kind), f"{name} is {kind}", OTHER_TYPE
     shapes = (
         array[None],
         array.reshape(-1),
@@ -89,7 +93,7 @@ def _hostile_array(rng: Random, old: Any, name: str, allowed: Range | None) -> t
         array.tolist(),
     )
     wrong = rng.choice(shapes)
-    return wrong, f"{name} has the shape {np.shape(wrong)}", ""
+    return wrong, f"{name} has the shape {np.shape(wrong)}", OTHER_TYPE
 
 
 def _range_of(owner: Any, chosen: dataclasses.Field) -> Range | None:

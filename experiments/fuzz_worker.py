@@ -69,7 +69,8 @@ class Worker:
                 must_refuse=call.must_refuse,
                 slow_s=_CALL_SLOW_S,
                 hang_s=_CALL_HANG_S,
-                may_be_nan=False,
+                other_type=call.other_type,
+                finite=call.finite,
             )
             return _with(verdict, call.text)
         if name == OPTIONS:

@@ -1,10 +1,14 @@
 """How work is put on Ray. The command line reads its defaults from here, so nothing heavy is imported."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
-from uavmec_jax.errors import StudyError
+from uavmec_jax.errors import ArgumentError, StudyError
+
+_MOST = 1_000_000
+"""Most cores, GPUs and retries."""
 
 LOCAL = "local"
 """The address that starts Ray on this machine."""
@@ -31,6 +35,16 @@ class RayOptions:
     resources: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     retries: int = 2
     time_limit_s: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, least in (("cpus_per_shard", 1), ("gpus_per_shard", 0), ("retries", 0)):
+            value = getattr(self, name)
+            whole = isinstance(value, int) and not isinstance(value, bool)
+            if not (value is None and name == "cpus_per_shard") and not (whole and least <= value <= _MOST):
+                raise ArgumentError(f"{name} is {value!r}; it should be a whole number from {least} to {_MOST:,}")
+        limit = self.time_limit_s
+        if limit is not None and not (isinstance(limit, int | float) and 0 < limit < math.inf):
+            raise ArgumentError(f"time_limit_s is {limit!r}; it should be a finite number of seconds above 0")
 
     @classmethod
     def of(cls, ray: "RayOptions | str | bool | None") -> "RayOptions | None":

@@ -1,5 +1,6 @@
 """Distributions of scenarios: each draw has other devices, hardware and traffic."""
 
+import dataclasses
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -9,8 +10,9 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, Num, PRNGKeyArray
 
 from uavmec_jax.env import hardware
+from uavmec_jax.env.checks import LARGEST, Bounds, Check, check_ranges
 from uavmec_jax.env.layout import Layout, Traffic, make_layout, mask_absent
-from uavmec_jax.env.params import MAX_DEVICES, Params
+from uavmec_jax.env.params import MAX_DEVICES, Params, check_params
 from uavmec_jax.env.rewards import Reward
 from uavmec_jax.env.scenario import Scenario
 from uavmec_jax.env.types import Range, Scalar
@@ -63,8 +65,41 @@ class ScenarioDistribution:
     traffic_weights: tuple[float, ...] | Float[Array, "*batch m"] = (0.0,)
 
 
+_AT_LEAST = Bounds(ge=0, le=LARGEST)
+_BOUNDS = {
+    **{name: Bounds(ge=0, le=1) for name in ("typical", "powered", "connected", "traffic", "traffic_weights")},
+    **{name: Bounds(ge=0, le=MAX_DEVICES) for name in ("typical_devices", "typical_least", "devices")},
+}
+
+
+def check_distribution(distribution: ScenarioDistribution, name: str = "distribution") -> None:
+    """Check every number of a distribution that is known.
+
+    Raises:
+        ArgumentError: one line that names the field.
+    """
+    check_params(distribution.params, f"{name}.params")
+    check_ranges(
+        [
+            Check(
+                f"{name}.{field.name}",
+                getattr(distribution, field.name),
+                _BOUNDS.get(field.name, _AT_LEAST),
+                ("value",),
+            )
+            for field in dataclasses.fields(distribution)
+            if field.name not in ("params", "reward")
+        ]
+    )
+
+
 def sample_scenario(distribution: ScenarioDistribution, key: PRNGKeyArray) -> Scenario:
-    """Draw a scenario; its layout has ``params.n_devices`` entries, of which the last ones may be padding."""
+    """Draw a scenario; its layout has ``params.n_devices`` entries, of which the last ones may be padding.
+
+    Raises:
+        ArgumentError: a number of the distribution is out of range; one line.
+    """
+    check_distribution(distribution)
     k_numbers, k_layout, k_traffic = jax.random.split(key, 3)
     numbers = iter(jax.random.uniform(k_numbers, (9,)))
     typical = next(numbers) < distribution.typical

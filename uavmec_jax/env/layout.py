@@ -10,9 +10,9 @@ from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num, PRNGKeyArray
 
 from uavmec_jax.env import hardware
-from uavmec_jax.env.checks import CAPACITY, LARGEST, POSITION, Bounds, Check, check_bool, check_ranges
+from uavmec_jax.env.checks import CAPACITY, LARGEST, POSITION, Bounds, Check, check_bool, check_range, check_ranges
 from uavmec_jax.env.fleet import UAV_FIELDS, Depots, Fleet, default_start
-from uavmec_jax.env.params import Params, check_params
+from uavmec_jax.env.params import MAX_DEVICES, Params, check_params
 from uavmec_jax.env.types import Scalar
 
 
@@ -261,6 +261,7 @@ def pad_layout(layout: Layout, size: int) -> Layout:
         ValueError: there are more than ``size`` devices.
     """
     chex.assert_rank(layout.capacity, 1)
+    check_range("size", size, ge=1, le=MAX_DEVICES, whole=True)
     n = layout.capacity.shape[0]
     if n > size:
         raise ValueError(f"the layout has {n} devices; they do not fit into {size}")

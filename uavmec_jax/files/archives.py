@@ -1,5 +1,6 @@
 """Named arrays in checked archives: NumPy's ``.npz`` without pickle, with a header, a schema and a SHA-256."""
 
+import errno
 import hashlib
 import json
 import math
@@ -140,7 +141,9 @@ def _reported(path: Path, error: type[UserError]) -> Iterator[list[type[Exceptio
     except Exception as problem:
         if not isinstance(problem, tuple(expected)):
             raise
-        raise error(f"{path}: cannot be read: {_reason(problem)}") from problem
+        # an offset in front of the file's beginning is damage; other errors of the system say nothing about the file
+        damage = isinstance(problem, OSError) and problem.errno == errno.EINVAL
+        raise error(f"{path}: cannot be read: {_reason(problem)}") from (None if damage else problem)
 
 
 def _reason(problem: Exception) -> str:

@@ -68,7 +68,7 @@ def upper_bound(params: Params, layout: Layout, volumes: Num[Array, "H n"], reac
     """
     check_scenario(params, layout)  # here without the batch's axis, so that the message names the device
     check_volumes(volumes, layout.n_devices)
-    check_range("reached", reached, ge=0, whole=True)
+    check_range("reached", reached, ge=0, lt=2**31, whole=True)
     params, layout, volumes = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], (params, layout, volumes))
     return int(upper_bounds(params, layout, volumes, np.array([reached]))[0])
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from uavmec_jax.agents.networks import count_weights
 from uavmec_jax.agents.registry import ALGORITHMS
+from uavmec_jax.env.checks import LARGEST, SMALLEST, check_range
 from uavmec_jax.runs.checkpoints import interval_s
 from uavmec_jax.runs.options import RunOptions
 from uavmec_jax.runs.run_plan import RunPlan
@@ -15,6 +16,8 @@ from uavmec_jax.studies.axes import TRACED_PARAMS
 from uavmec_jax.studies.parts import split_study
 from uavmec_jax.studies.population import n_agents, n_clairvoyant_seeds, n_seeds
 from uavmec_jax.studies.schema import Study
+
+_MOST_DEVICES = 1_000_000
 
 # Measured on two cores of a laptop-sized machine; see results/simulation.
 _START_S = 4.0
@@ -94,8 +97,14 @@ def simulate(
         devices: number of devices of all machines together.
         options: how the run would be checkpointed.
         on_ray: whether Ray is started for it.
+
+    Raises:
+        ArgumentError: the speed or the number of devices is out of range; one line.
     """
     options = options or RunOptions()
+    check_range("devices", devices, ge=1, le=_MOST_DEVICES, whole=True)
+    for device_speed in speed.values() if isinstance(speed, Mapping) else (speed,):
+        check_range("speed", device_speed, ge=SMALLEST, le=LARGEST)
     training = other = checkpoints = shards = results = 0.0
     groups = max(partition.groups for partition in plan.partitions.values())
     at_once = max(min(devices // groups, len(plan.shards)), 1)

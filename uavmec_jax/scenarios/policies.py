@@ -134,7 +134,7 @@ class TrainedPolicy:
                 one: for each device its features and a 1 behind them.
 
         Raises:
-            PolicyError: the observation has another shape, or is not an array of numbers.
+            PolicyError: the observation has another shape, or is not an array of finite numbers.
         """
         try:
             array = np.asarray(observation, np.float32)
@@ -145,6 +145,8 @@ class TrainedPolicy:
         if last != size and (self.n_devices or last == 0 or last % size):
             shapes = f"({size},) or (..., {size})" if self.n_devices else f"(..., {size} for each device)"
             raise PolicyError(f"the observation has the shape {array.shape}; it should be {shapes}")
+        if not np.isfinite(array).all():
+            raise PolicyError("the observation has numbers that are not finite")
         return np.asarray(self._greedy(array))
 
     def value(self, params: Params, layout: Layout, states: State) -> Float[Array, " B"]:

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, ArrayLike, Int, Key
 
+from uavmec_jax.env.checks import check_range
 from uavmec_jax.env.layout import Layout, sample_layout
 from uavmec_jax.env.params import Params
 
@@ -22,15 +23,31 @@ class Stream(enum.IntEnum):
     """The one draw that is the same for every agent."""
 
 
+MAX_DRAWS = 1_000_000
+"""Most draws at once."""
+
+
 def layout_for_seed(
     seed: Int[ArrayLike, ""], params: Params, n_powered: Int[ArrayLike, ""], n_connected: Int[ArrayLike, ""]
 ) -> Layout:
-    """Return the layout of a seed; with lower counts it has the same devices, fewer of them with power or communication."""
+    """Return the layout of a seed; with lower counts it has the same devices, fewer of them with power or communication.
+
+    Raises:
+        ArgumentError: the seed, a count or a parameter is out of range; one line.
+    """
+    check_range("seed", seed, ge=0, lt=2**32, whole=True)
     return sample_layout(jax.random.fold_in(jax.random.key(Stream.LAYOUT), seed), params, n_powered, n_connected)
 
 
 def held_out_draws(seed: int, powered: int, connected: int, draws: int) -> Key[Array, " D"]:
-    """Return the first ``draws`` volume draws on which studies evaluate policies in the scenario of a seed."""
+    """Return the first ``draws`` volume draws on which studies evaluate policies in the scenario of a seed.
+
+    Raises:
+        ArgumentError: a number is out of range; one line.
+    """
+    for name, value in (("seed", seed), ("powered", powered), ("connected", connected)):
+        check_range(name, value, ge=0, lt=2**31, whole=True)
+    check_range("draws", draws, ge=1, le=MAX_DRAWS, whole=True)
     identity = np.array([[seed], [powered], [connected]], np.int32)
     return jax.random.split(identity_keys(Stream.HELD_OUT, *identity)[0], draws)
 

@@ -26,6 +26,9 @@ from uavmec_jax.scenarios.uav_states import (
 
 _MAX_SLOTS = 1_000_000
 
+_LEAST = float(np.finfo(np.float32).tiny)
+"""Least energy of a battery that is not empty: in single precision, less counts as 0."""
+
 
 class StateFile(UavStates):
     """Contents of a state file; what is left out is as in the initial state.
@@ -130,7 +133,7 @@ def _check_devices(
         where = f"device {number} ({name}): "
         if failed >= 0 and energy != 0:
             raise ValueError(f"{where}battery_j is {energy:g}, but failed_at is given; leave one of them out")
-        if failed < 0 and not 0 < energy <= capacity * (1 + 1e-6):
+        if failed < 0 and not _LEAST <= energy <= capacity * (1 + 1e-6):
             or_failed = ", or failed_at if it is empty" if goes_on else ""
             raise ValueError(
                 f"{where}battery_j is {energy:g}; give more than 0 and at most {capacity:g}, its capacity{or_failed}"

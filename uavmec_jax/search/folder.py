@@ -55,9 +55,11 @@ def search_folder(directory: str | Path, space: Space, command: str = "") -> Ite
     try:
         with lock_folder(path / WORK, path, if_dead=f"if that process is dead, remove {path / WORK}"):
             try:
+                if begun := _begun(path, space):  # asked again: whoever held the lock may have written
+                    with opened_trials(path, space):  # before anything is written
+                        pass
                 facts = {"space": space.model_dump(mode="json"), "command": command} | host.describe()
-                # asked again: whoever held the lock may have written
-                write_text(path / FACTS, json.dumps(facts | {"begun": _begun(path, space)}))
+                write_text(path / FACTS, json.dumps(facts | {"begun": begun}))
                 yield path
             finally:
                 remove_folder(path / WORK)
@@ -155,6 +157,7 @@ def _tables(database: Path) -> set[str]:
         return set()
     # not read-only: what a killed process has left of a transaction is undone first
     with closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=rw", uri=True, timeout=_WAIT_S)) as connection:
+        connection.text_factory = lambda name: name.decode(errors="replace")  # of a damaged database
         return {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
 
 
