@@ -11,6 +11,7 @@ shows the traceback. Writes `fuzz.json` and `README.md`.
 """
 
 import argparse
+import json
 import os
 import sys
 import tempfile
@@ -46,13 +47,29 @@ def table(report: dict) -> str:
     )
 
 
+def merged(before: dict, report: dict) -> dict:
+    """Return a report in which the kinds that were done again have their new rows."""
+    again = report["kinds"]
+    kinds = before["kinds"] | again
+    failures = [one for one in before["failures"] if one["first"].rpartition(":")[0] not in again]
+    rows = kinds.values()
+    total = {name: sum(row[name] for row in rows) for name in ("inputs", "accepted", "refused", "failures", "seconds")}
+    slowest = max((row["slowest"] for row in rows), key=lambda one: one["seconds"])
+    return report | {
+        "command": f"{before['command']}\n{report['command']}",
+        "kinds": kinds,
+        "all": total | {"slowest": slowest},
+        "failures": failures + report["failures"],
+    }
+
+
 def main() -> None:
     """Fuzz, and write what came of it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--inputs", type=int, default=50_000, help="mutated files and command lines")
     parser.add_argument("--calls", type=int, default=2000, help="Python calls")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--kinds", nargs="*", help="only kinds whose names hold one of these")
+    parser.add_argument("--kinds", nargs="*", help="only kinds whose names hold one of these; in OUT, other rows stay")
     parser.add_argument("--case", help="one input, KIND:NUMBER, again, with its traceback")
     parser.add_argument("--work", type=Path, help="folder that keeps the valid files and the inputs that fail")
     parser.add_argument("--out", type=Path, help="folder of fuzz.json and README.md")
@@ -67,6 +84,8 @@ def main() -> None:
     machine = {name: value for name, value in host.describe().items() if name != "free_memory_gib"}
     command = " ".join(["python", os.path.relpath(sys.argv[0]), *sys.argv[1:]])
     report = {"command": command, "seed": arguments.seed, **report, **machine}
+    if arguments.out and arguments.kinds and (arguments.out / "fuzz.json").exists():
+        report = merged(json.loads((arguments.out / "fuzz.json").read_text(encoding="utf-8")), report)
     if arguments.out:
         write_report(arguments.out / "fuzz.json", report)
         write_text(arguments.out / "README.md", table(report))

@@ -53,6 +53,7 @@ def changed(layout: Layout, device: int, change: str) -> Layout:
     A removed device stays in the arrays: it lacks nothing, has no work, and its hover point becomes that of a neighbour. It
     is marked as absent if the layout says which devices are present.
     """
+    layout = jax.tree.map(jnp.asarray, layout)  # the caller's arrays may be NumPy's
     if change == "repair power":
         return replace(layout, has_power=layout.has_power.at[device].set(True))
     if change == "repair comms":

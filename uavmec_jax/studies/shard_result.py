@@ -133,6 +133,8 @@ class ShardResult:
         axes = {name: [agent_id[name] for agent_id in ids] for name in ids[0]}
         if any(name not in self.rows or self.rows[name].tolist() != values for name, values in axes.items()):
             raise StudyError(f"{source}: belongs to another shard: its agents are not those of this one")
+        if self.steps and not (self.seconds.get("train", 0.0) > 0 and "validate" in self.seconds):
+            raise StudyError(f"{source}: seconds are {self.seconds}; training takes some, and has those of validation")
         parts = [name for name in PART_AXES if name in axes and name not in study.axes]
         check_agents(study, self.rows.drop(columns=parts), source)
         check_evaluation(study, len(ids), self.evaluation, source)
