@@ -44,7 +44,14 @@ def test_benchmark_accelerator(tmp_path):
 
 
 def test_simulation_against_a_run(tmp_path):
-    settings = ("algorithm=none", "axes.seeds=1", "axes.powered=[8]", "evaluation.draws=2", "evaluation.planners=[]")
+    settings = (
+        "algorithm=none",
+        "axes.seeds=1",
+        "axes.powered=[8]",
+        "evaluation.draws=2",
+        "evaluation.planner_draws=2",
+    )
+    settings = (*settings, "evaluation.planners=[]")
     options = ["--study", "planning", *(part for setting in settings for part in ("--set", setting))]
     out = run("simulation_against_a_run.py", *options, "--out", tmp_path / "run")
     assert "wall time" in out

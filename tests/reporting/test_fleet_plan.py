@@ -202,7 +202,8 @@ def test_pixels_show_all_uavs():
 def run_plan(tmp_path, *arguments):
     file = tmp_path / "hamlet.toml"
     file.write_text(HAMLET)
-    arguments = [file, "--draws", 1, "--width", 2, "--out", tmp_path / "out", *arguments]
+    width = ("--width", 2) if "end=first_failure" in arguments else ()
+    arguments = [file, "--draws", 1, *width, "--out", tmp_path / "out", *arguments]
     done = CliRunner().invoke(main, ["plan", *map(str, arguments)], catch_exceptions=False)
     assert done.exit_code == 0, done.output
     return done.stdout

@@ -81,14 +81,10 @@ def check_distribution(distribution: ScenarioDistribution, name: str = "distribu
     check_params(distribution.params, f"{name}.params")
     check_ranges(
         [
-            Check(
-                f"{name}.{field.name}",
-                getattr(distribution, field.name),
-                _BOUNDS.get(field.name, _AT_LEAST),
-                ("value",),
-            )
+            Check(f"{name}.{field.name}", leaf, _BOUNDS.get(field.name, _AT_LEAST), ("value",))
             for field in dataclasses.fields(distribution)
             if field.name not in ("params", "reward")
+            for leaf in jax.tree.leaves(getattr(distribution, field.name))  # one end of a range may be traced
         ]
     )
 
