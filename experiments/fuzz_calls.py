@@ -217,7 +217,7 @@ _UNCHECKED = (
         um.env.make_fleet,
     ),
     *(um.planning.earliest_deadline, um.planning.HEURISTICS["oldest-first"], um.planning.planned_slots),
-    *(um.env.pad_layout, um.env.measure, _ENV.step),
+    *(um.env.pad_layout, um.env.measure, _ENV.step, um.training.Validation),
 )
 _ACTION: dict[str, Range] = {"action": (0, _DEVICES - 1)}
 _COUNTS: dict[str, Range] = {"n_powered": (0, _DEVICES), "n_connected": (0, _DEVICES)}
@@ -288,7 +288,7 @@ CALLS: dict[str, Call] = {
         hyper={"learning_rate": 1e-3, "gamma": 0.9},
         settings={"hidden": (4,)},
     ),
-    "Validation": _call(1, um.training.Validation, "", {"every": MANY, "draws": MANY}, every=100, draws=2, chunks=2),
+    "Validation": _call(1, um.training.Validation, every=100, draws=2, chunks=2),
     "RunOptions": _call(
         2, um.runs.RunOptions, "", _RUN, checkpoint="full", checkpoint_every_s=1.0, checkpoint_share=0.1
     ),

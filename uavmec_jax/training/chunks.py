@@ -6,8 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from uavmec_jax.agents.algorithm import Algorithm
-from uavmec_jax.agents.registry import MAX_STEPS
-from uavmec_jax.env.checks import check_range
 
 
 @dataclass(frozen=True)
@@ -23,10 +21,6 @@ class Validation:
     every: int = 10_000
     draws: int = 8
     chunks: int = 4
-
-    def __post_init__(self) -> None:
-        for name in ("every", "draws", "chunks"):
-            check_range(name, getattr(self, name), ge=1, le=MAX_STEPS, whole=True)
 
 
 @dataclass(frozen=True)
