@@ -54,7 +54,8 @@ def main() -> None:
 
 def measure_nodes(work: Path, settings: list[str], counts: list[int]) -> dict[str, Any]:
     """Measure the wall time of a study on some numbers of nodes, and simulate it."""
-    options = [part for setting in settings for part in ("--set", setting)] + ["--shard-size", str(SHARD_SIZE)]
+    last = {setting.partition("=")[0]: setting for setting in settings}  # a setting is given once
+    options = [part for setting in last.values() for part in ("--set", setting)] + ["--shard-size", str(SHARD_SIZE)]
     alone = uavmec(["run", "table5", *options, "--out", str(work / "alone")], core=min(os.sched_getaffinity(0)))
     speed = read_run(work / "alone")["training_steps_per_second"]
     rows: list[dict[str, Any]] = [
