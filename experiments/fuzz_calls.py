@@ -208,16 +208,9 @@ def _with_horizon() -> Params:
 
 _ENV = um.UavMecEnv()
 _UNCHECKED = (
-    *(
-        um.transition,
-        um.env.advance,
-        um.env.observe,
-        um.planning.observe_devices,
-        um.env.draw_volumes,
-        um.env.make_fleet,
-    ),
+    *(um.transition, um.env.advance, um.env.observe, um.planning.observe_devices, um.env.draw_volumes),
     *(um.planning.earliest_deadline, um.planning.HEURISTICS["oldest-first"], um.planning.planned_slots),
-    *(um.env.pad_layout, um.env.measure, _ENV.step, um.training.Validation),
+    *(um.env.make_fleet, um.env.pad_layout, um.env.measure, _ENV.step, um.training.Validation),
 )
 _ACTION: dict[str, Range] = {"action": (0, _DEVICES - 1)}
 _COUNTS: dict[str, Range] = {"n_powered": (0, _DEVICES), "n_connected": (0, _DEVICES)}

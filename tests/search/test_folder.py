@@ -129,35 +129,23 @@ def another_programs(path):
         connection.execute("CREATE TABLE cookies (name TEXT)")
 
 
-def another_name(path):
-    with closing(sqlite3.connect(path)) as connection, connection:
-        connection.execute("UPDATE studies SET study_name = 'other'")
+def after(*statements):
+    """Return a function that makes changes to a database."""
+
+    def change(path):
+        with closing(sqlite3.connect(path)) as connection, connection:
+            for statement in statements:
+                connection.execute(statement)
+
+    return change
 
 
-def another_space(path):
-    with closing(sqlite3.connect(path)) as connection, connection:
-        connection.execute("UPDATE study_user_attributes SET value_json = '\"x\"'")
-
-
-def without_batches(path):
-    with closing(sqlite3.connect(path)) as connection, connection:
-        connection.execute("UPDATE trials SET state = 'COMPLETE'")
-        connection.execute("DELETE FROM trial_user_attributes")
-
-
-def another_optuna(path):
-    with closing(sqlite3.connect(path)) as connection, connection:
-        connection.execute("UPDATE alembic_version SET version_num = 'v99'")
-
-
-def nonsense_inside(path):
-    with closing(sqlite3.connect(path)) as connection, connection:
-        connection.execute("UPDATE trials SET state = 'WON'")
-
-
-def other_columns(path):
-    with closing(sqlite3.connect(path)) as connection, connection:
-        connection.execute("ALTER TABLE studies RENAME COLUMN study_name TO title")
+another_name = after("UPDATE studies SET study_name = 'other'")
+another_space = after("UPDATE study_user_attributes SET value_json = '\"x\"'")
+without_batches = after("UPDATE trials SET state = 'COMPLETE'", "DELETE FROM trial_user_attributes")
+another_optuna = after("UPDATE alembic_version SET version_num = 'v99'")
+nonsense_inside = after("UPDATE trials SET state = 'WON'")
+other_columns = after("ALTER TABLE studies RENAME COLUMN study_name TO title")
 
 
 def a_folder(path):

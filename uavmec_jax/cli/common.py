@@ -119,9 +119,9 @@ def print_tables(console: Any, tables: dict[str, Any], lines: list[str], directo
         console.print(title, style="bold")
         console.print(table)
     for line in lines:
-        console.print(line, highlight=False, markup=False)
+        console.print(line, highlight=False)
     if directory is not None:
-        console.print(f"Files: {directory}", highlight=False, markup=False, soft_wrap=True)
+        console.print(f"Files: {directory}", highlight=False, soft_wrap=True)
 
 
 def new_folder(name: str) -> Path:

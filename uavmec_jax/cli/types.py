@@ -1,8 +1,9 @@
 """Types of arguments and options. What is outside their bounds is refused in one line, before anything heavy is imported."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import click
 
@@ -13,6 +14,9 @@ _MAX_PATH_BYTES, _MAX_NAME_BYTES = 4095, 255
 
 MAX_SECONDS = 31_536_000.0
 """Longest time that an option takes: a year."""
+
+
+_Number = TypeVar("_Number", int, float)
 
 
 def name_of(param: click.Parameter | None) -> str:
@@ -95,6 +99,23 @@ class NameOrPath(click.ParamType):
         return str(value)
 
 
+def _within(
+    bounds: Any, parse: Callable[[Any], _Number], value: Any, param: click.Parameter | None, right: str
+) -> _Number:
+    """Return a value as a number between two bounds, neither of which NaN is.
+
+    Raises:
+        InputError: it is no number or out of bounds; the line says what would be ``right``.
+    """
+    try:
+        number = parse(value)
+    except ValueError:
+        raise InputError(f"{name_of(param)} is {value!r}; give {right}") from None
+    if not bounds.min <= number <= bounds.max:
+        raise InputError(f"{name_of(param)} is {value}; give {right}")
+    return number
+
+
 class WholeNumber(click.IntRange):
     """A whole number between two bounds."""
 
@@ -103,13 +124,7 @@ class WholeNumber(click.IntRange):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
         """Return the number, and refuse what is none or out of bounds."""
-        try:
-            number = int(value)
-        except ValueError:
-            number, value = None, repr(value)
-        if number is None or not self.min <= number <= self.max:  # type: ignore[operator]
-            raise InputError(f"{name_of(param)} is {value}; give a whole number from {self.min} to {self.max}")
-        return number
+        return _within(self, int, value, param, f"a whole number from {self.min} to {self.max}")
 
 
 class FiniteRange(click.FloatRange):
@@ -120,13 +135,7 @@ class FiniteRange(click.FloatRange):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Return the number, and refuse what is none or out of bounds."""
-        try:
-            number = float(value)
-        except ValueError:
-            number, value = None, repr(value)
-        if number is None or not self.min <= number <= self.max:  # type: ignore[operator]
-            raise InputError(f"{name_of(param)} is {value}; give a number from {self.min:g} to {self.max:g}")
-        return number
+        return _within(self, float, value, param, f"a number from {self.min:g} to {self.max:g}")
 
 
 def given(*names: str) -> list[str]:

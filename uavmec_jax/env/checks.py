@@ -27,7 +27,7 @@ LEAST_CAPACITY_J = 1e-3
 
 MAX_LENGTH_M = 1e7
 """Largest coordinate, side of a region, altitude and signal range: beyond it, squares of distances lose their metres in
-float32."""
+float32. Northings of networks in UTM come up to it."""
 
 _TINY = float(np.finfo(np.float32).tiny)  # in single precision, what is closer to 0 counts as 0,
 _HUGE = float(np.finfo(np.float32).max)  # and what is further from 0 as infinite

@@ -11,9 +11,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from uavmec_jax.env.checks import MAX_LENGTH_M
 from uavmec_jax.errors import TrafficError
 from uavmec_jax.files.xml import CheckingHandler, RefusedError, copy_xml
-from uavmec_jax.traffic.evacuation_schema import MAX_LANES, MAX_METRES
+from uavmec_jax.traffic.evacuation_schema import MAX_LANES
 
 _ELEMENTS: Mapping[str, tuple[str, ...]] = {
     "osm": ("osm", "bounds", "note", "meta", "remark", "node", "way", "relation", "tag", "nd", "member"),
@@ -159,10 +160,10 @@ class _Elements(CheckingHandler):
             values = [float(value) for value in attrs[attribute].replace(",", " ").split()]
         except ValueError:
             values = [math.nan]
-        if not all(abs(value) <= MAX_METRES for value in values):
+        if not all(abs(value) <= MAX_LENGTH_M for value in values):
             raise RefusedError(
                 f"{attribute} of {_label(name, attrs)} is {attrs[attribute][:60]!r}; it should hold metres, numbers of at "
-                f"most {MAX_METRES:g} in size"
+                f"most {MAX_LENGTH_M:g} in size"
             )
 
     def _check_map(self, name: str, attrs: Any) -> None:

@@ -1,6 +1,5 @@
 """The result of a simulated evacuation: one small file, which training, evaluation and figures read without SUMO."""
 
-import os
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -10,9 +9,8 @@ from jaxtyping import Bool, Float, Int
 
 from uavmec_jax.errors import TrafficError
 from uavmec_jax.files.archives import MAX_USER_BYTES, read_checked, write_checked
-from uavmec_jax.files.validation import suggest
 from uavmec_jax.traffic.evacuation_schema import check_evacuation
-from uavmec_jax.traffic.place import PLACES, shipped_places
+from uavmec_jax.traffic.place import file_of
 
 SCHEMA = 1
 """Version of the file format."""
@@ -135,11 +133,7 @@ def load_evacuation(source: str | Path) -> Evacuation:
         TrafficError: no shipped place has that name; the file does not exist, is damaged, was altered, is of another kind or
             version, or holds something that no evacuation has; one line.
     """
-    path = Path(source)
-    if str(source) in shipped_places():
-        path = Path(str(PLACES / str(source) / "evacuation.npz"))
-    elif not path.suffix and not os.path.lexists(path):
-        raise TrafficError(f"{source}: neither a file nor a shipped place; {suggest(str(source), shipped_places())}")
+    path = file_of(source, "evacuation.npz")
     facts, arrays = read_checked(path, SCHEMA, "an evacuation", TrafficError, max_bytes=MAX_USER_BYTES)
     expected = {field.name for field in fields(Evacuation)} - {"meta"}
     if set(arrays) != expected or "meta" not in facts:

@@ -7,12 +7,10 @@ import numpy as np
 import pydantic
 from pydantic import Field
 
+from uavmec_jax.env.checks import MAX_LENGTH_M
 from uavmec_jax.env.params import MAX_DEVICES
 from uavmec_jax.errors import TrafficError
 from uavmec_jax.files.validation import PrintableName, PrintableText, StrictModel, from_array, validated
-
-MAX_METRES = 1e7
-"""Largest coordinate, in metres: networks in UTM have northings up to it."""
 
 MAX_DENSITY = 1e7
 """Largest density, in vehicles per km and lane: a vehicle on the shortest road that SUMO builds counts 10,000."""
@@ -100,12 +98,12 @@ def check_evacuation(source: object, meta: Any, arrays: Mapping[str, np.ndarray]
 
     corners = len(arrays["road_shape"])
     ranges: tuple[tuple[str, float, float, Callable[[int], str]], ...] = (
-        ("position", -MAX_METRES, MAX_METRES, device),
+        ("position", -MAX_LENGTH_M, MAX_LENGTH_M, device),
         ("density", 0, MAX_DENSITY, device),
         ("density_spread", 0, MAX_DENSITY, device),
         ("weight", 0, 1, device),
         ("window_weight", 0, 1, device),
-        ("road_shape", -MAX_METRES, MAX_METRES, corner),
+        ("road_shape", -MAX_LENGTH_M, MAX_LENGTH_M, corner),
         ("road_corners", 2, corners, road),
         ("road_lanes", 1, MAX_LANES, road),
         ("road_density", 0, MAX_DENSITY, road),

@@ -14,13 +14,14 @@ import numpy as np
 import platformdirs
 from jaxtyping import Float, Int
 
+from uavmec_jax.env.checks import MAX_LENGTH_M
 from uavmec_jax.errors import TrafficError
 from uavmec_jax.files import xml
 from uavmec_jax.files.reading import read_bytes
 from uavmec_jax.files.writing import atomic
 from uavmec_jax.traffic import sumo
 from uavmec_jax.traffic.checked_xml import Contents, checked_copy
-from uavmec_jax.traffic.evacuation_schema import MAX_LANES, MAX_METRES, MAX_ROADS
+from uavmec_jax.traffic.evacuation_schema import MAX_LANES, MAX_ROADS
 from uavmec_jax.traffic.place import NetworkSource
 from uavmec_jax.traffic.workspace import Workspace
 
@@ -277,6 +278,6 @@ def _make_road(edge: Any) -> Road:
 def _check_points(points: list[Any], label: str) -> Float[np.ndarray, "k 2"]:
     """Return points as an array, after checking that they are metres on the Earth."""
     shape = np.array(points, float)
-    if not (np.abs(shape) <= MAX_METRES).all():
-        raise TrafficError(f"{label}: has a coordinate that is not a number of metres up to {MAX_METRES:g}")
+    if not (np.abs(shape) <= MAX_LENGTH_M).all():
+        raise TrafficError(f"{label}: has a coordinate that is not a number of metres up to {MAX_LENGTH_M:g}")
     return shape

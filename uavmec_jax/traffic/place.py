@@ -167,6 +167,20 @@ class Place(StrictModel):
         return self
 
 
+def file_of(source: str | Path, name: str) -> Path:
+    """Return the file of this name of a shipped place; if there is no such place, ``source`` as the path of a file.
+
+    Raises:
+        TrafficError: it is neither.
+    """
+    path = Path(source)
+    if str(source) in shipped_places():
+        return Path(str(PLACES / str(source) / name))
+    if not path.suffix and not os.path.lexists(path):
+        raise TrafficError(f"{source}: neither a file nor a shipped place; {suggest(str(source), shipped_places())}")
+    return path
+
+
 def load_place(source: str | Path, overrides: dict[str, Any] | None = None) -> tuple[Place, Path]:
     """Load a place that ships with the package, or a file.
 
@@ -181,14 +195,7 @@ def load_place(source: str | Path, overrides: dict[str, Any] | None = None) -> t
     Raises:
         TrafficError: the file does not exist, is not TOML, or holds an invalid value; one line.
     """
-    if str(source) in shipped_places():
-        path = Path(str(PLACES / str(source) / "place.toml"))
-    else:
-        path = Path(source)
-        if not path.suffix and not os.path.lexists(path):
-            raise TrafficError(
-                f"{source}: neither a file nor a shipped place; {suggest(str(source), shipped_places())}"
-            )
+    path = file_of(source, "place.toml")
     data = parse_toml(read_text(path, TrafficError), path, TrafficError)
     for table, settings in (overrides or {}).items():
         if not isinstance(settings, dict):

@@ -6,13 +6,14 @@ from typing import Annotated, Any
 import pydantic
 from pydantic import Field
 
+from uavmec_jax.env.checks import MAX_LENGTH_M
 from uavmec_jax.env.params import MAX_DEVICES
 from uavmec_jax.errors import TrafficError
 from uavmec_jax.files.parsing import parse_toml
 from uavmec_jax.files.reading import read_text
 from uavmec_jax.files.validation import PrintableName, PrintableText, StrictModel, from_array, validated
 
-_Metres = Annotated[float, Field(ge=-1e7, le=1e7)]
+_Metres = Annotated[float, Field(ge=-MAX_LENGTH_M, le=MAX_LENGTH_M)]
 
 
 class Site(StrictModel):

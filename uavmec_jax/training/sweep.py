@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
-import pydantic
 from jaxtyping import PRNGKeyArray
 
 from uavmec_jax.agents.algorithm import Agent, Algorithm
-from uavmec_jax.agents.registry import ALGORITHMS, MAX_STEPS, SCENARIO_SETTINGS, RegisteredAlgorithm, check_end
+from uavmec_jax.agents.registry import ALGORITHMS, MAX_STEPS, RegisteredAlgorithm, check_end
+from uavmec_jax.agents.settings import SETTINGS
 from uavmec_jax.cluster.connection import connected
 from uavmec_jax.cluster.options import RayOptions
 from uavmec_jax.env.checks import Bounds, Check, check_range, check_ranges
@@ -25,7 +25,7 @@ from uavmec_jax.env.rollout import Policy
 from uavmec_jax.env.scenario import Scenario
 from uavmec_jax.env.scenario_checks import check_scenario
 from uavmec_jax.errors import ArgumentError, StudyError
-from uavmec_jax.files.validation import describe_error, model_from_dataclasses, suggest
+from uavmec_jax.files.validation import suggest, validated
 from uavmec_jax.training.chunks import Validation
 from uavmec_jax.training.machine import Machine, probe_node
 from uavmec_jax.training.on_ray import PopulationOnRay, ShardProgram
@@ -127,7 +127,7 @@ def train(
         check_range(f"validation.{name}", getattr(validation, name), ge=1, whole=True)
     n, n_devices = scenarios.layout.capacity.shape
     max_age = int(np.max(scenarios.params.data_age_limit_slots)) + 1
-    bound = _bind(registered, settings or {}, steps, n_devices, max_age)
+    bound = _bind(algorithm, settings or {}, steps, n_devices, max_age)
     batched_hyper = _batch_hyper(algorithm, registered, hyper or {}, n)
     training_key, validation_key = jax.random.split(key)
     agents = Agent(key=jax.random.split(training_key, n), scenario=scenarios, hyper=batched_hyper)
@@ -172,20 +172,15 @@ def _check_scenarios(algorithm: str, scenarios: Scenario, observation: str) -> N
         raise StudyError(str(error)) from None
 
 
-def _bind(
-    registered: RegisteredAlgorithm, settings: Mapping[str, Any], steps: int, n_devices: int, max_age: int
-) -> Algorithm:
+def _bind(algorithm: str, settings: Mapping[str, Any], steps: int, n_devices: int, max_age: int) -> Algorithm:
     """Return the algorithm with its static settings bound; those not given have their defaults."""
+    registered = ALGORITHMS[algorithm]
     defaults = {name: registered.defaults[name] for name in registered.static}
     for name in settings:
         if name not in defaults:
             raise StudyError(f"settings has {name!r}; {suggest(name, defaults)}")
     settings = {name: value.item() if isinstance(value, np.generic) else value for name, value in settings.items()}
-    model = model_from_dataclasses("Settings", registered.spec, leave_out=SCENARIO_SETTINGS)
-    try:
-        model.model_validate(settings)
-    except pydantic.ValidationError as error:
-        raise ArgumentError(describe_error("settings", error, model)) from None
+    validated(SETTINGS[algorithm], settings, "settings", ArgumentError)
     try:
         return registered.make(defaults | dict(settings), total_steps=steps, n_devices=n_devices, max_age=max_age)
     except ValueError as error:
