@@ -6,7 +6,7 @@ import pytest
 
 from tests.experiments.scripts import run
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.full
 
 
 def test_benchmark_on_policy(tmp_path):

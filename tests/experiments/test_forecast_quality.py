@@ -33,7 +33,7 @@ def test_the_rest_is_the_probability_of_no_failure():
     assert_allclose(with_no_failure(np.array([[0.25, 0.25], [0.5, 0.5]])), [[0.25, 0.25, 0.5], [0.5, 0.5, 0.0]])
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_probabilities_of_two_scenarios():
     params = Params(n_devices=4)
     keys = jax.random.split(jax.random.key(0), 2)

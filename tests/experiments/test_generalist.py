@@ -7,7 +7,7 @@ import pytest
 from tests.experiments.scripts import run
 from uavmec_jax.scenarios.policies import load_policy
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.full
 
 
 def test_generalist_training(tmp_path):

@@ -11,7 +11,7 @@ from uavmec_jax.runs.run import run_study
 from uavmec_jax.studies.study import load_study
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_ablation(tmp_path):
     options = ("--steps", 2048, "--seeds", 1, "--variants", "no gap", "--runs", tmp_path / "runs", "--out", tmp_path)
     assert "no gap" in run("q_ablation.py", *options)
@@ -20,7 +20,7 @@ def test_ablation(tmp_path):
     assert table["last_low"] <= table["last"] <= table["last_high"]
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_time_to_quality(tmp_path):
     learner = "PQN (table5-best)"
     options = ("--steps", 4096, "--every", 2048, "--seeds", 1, "--learners", learner, "--no-sb3", "--out", tmp_path)
@@ -41,7 +41,7 @@ def test_time_to_quality(tmp_path):
     assert (tmp_path / "time_to_quality.png").stat().st_size > 10_000
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_learning_curves(tmp_path):
     small = {
         "axes.powered": [8],

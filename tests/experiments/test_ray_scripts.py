@@ -7,7 +7,7 @@ import pytest
 
 from tests.experiments.scripts import run
 
-pytestmark = pytest.mark.ray
+pytestmark = [pytest.mark.ray, pytest.mark.full]
 
 
 def test_faults(tmp_path):

@@ -4,21 +4,22 @@ import pytest
 
 from tests.experiments.scripts import run
 
-pytestmark = pytest.mark.slow
 
-
+@pytest.mark.slow
 def test_table5_grid(tmp_path):
     out = run("table5_grid.py", "--seeds", 1, "--steps", 400, "--out", tmp_path / "grid")
     assert "Lifetime in slots" in out
     assert (tmp_path / "grid" / "figure.png").exists()
 
 
+@pytest.mark.full
 def test_table6_rewards(tmp_path):
     out = run("table6_rewards.py", "--seeds", 1, "--steps", 400, "--out", tmp_path / "table6")
     assert "8 powered, 8 connected: lifetime in slots" in out
     assert (tmp_path / "table6" / "figure.png").exists()
 
 
+@pytest.mark.full
 def test_table7_evacuation(tmp_path):
     out = run("table7_evacuation.py", "--seeds", 1, "--steps", 400, "--out", tmp_path / "table7")
     assert "round_lake: first failures of each device" in out
@@ -27,6 +28,7 @@ def test_table7_evacuation(tmp_path):
     assert pictures == {"round_lake.png", "round_lake.gif", "albany.png", "albany.gif"}
 
 
+@pytest.mark.full
 def test_figure3_training(tmp_path):
     run("figure3_training.py", "--steps", 20_000, "--out", tmp_path)
     assert (tmp_path / "figure3.png").stat().st_size > 20_000

@@ -35,7 +35,7 @@ def jitted_rollout(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first_seed", range(0, 40, 10))
+@pytest.mark.parametrize("first_seed", [0, *(pytest.param(seed, marks=pytest.mark.full) for seed in (10, 20, 30))])
 def test_nothing_exceeds_the_bound_on_small_instances(first_seed):
     """No policy exceeds the optimum, no optimum the bound, and a wide beam reaches the optimum."""
     for seed in range(first_seed, first_seed + 10):
@@ -69,7 +69,9 @@ def test_no_policy_exceeds_the_bound_at_the_papers_settings(powered, connected):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("side", [150.0, 300.0, 800.0])
+@pytest.mark.parametrize(
+    "side", [pytest.param(150.0, marks=pytest.mark.full), 300.0, pytest.param(800.0, marks=pytest.mark.full)]
+)
 def test_no_policy_exceeds_the_bound_on_many_layouts(side):
     """The regions range from crowded, where most devices share hover points, to the paper's."""
     count = 32

@@ -89,7 +89,7 @@ def check_requirements(params, layout, key, volumes, tours):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("uavs", [1, 2, 3])
+@pytest.mark.parametrize("uavs", [pytest.param(1, marks=pytest.mark.full), 2, pytest.param(3, marks=pytest.mark.full)])
 def test_tours_meet_the_requirements(uavs):
     longest = []
     for seed in range(20):
@@ -103,7 +103,7 @@ def test_tours_meet_the_requirements(uavs):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first_seed", [0, 15])
+@pytest.mark.parametrize("first_seed", [0, pytest.param(15, marks=pytest.mark.full)])
 def test_no_optimum_exceeds_the_bound(first_seed):
     """Nor does it break a requirement, and in most instances it is the bound."""
     gaps = []

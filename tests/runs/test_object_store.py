@@ -176,7 +176,7 @@ def folder(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGTERM, marks=pytest.mark.full), signal.SIGKILL])
 def test_a_run_that_was_stopped_continues_in_another_process(server, folder, number):
     """Over the S3 protocol; the bits are those of a run in a folder."""
     url = f"s3://{BUCKET}/stopped-{number}"
