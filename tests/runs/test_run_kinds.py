@@ -35,7 +35,13 @@ def test_resuming_needs_the_reward_function_again(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "observation"), [("dqn", "paper"), ("dqn", "full"), ("ppo", "paper"), ("pqn", "paper")]
+    ("algorithm", "observation"),
+    [
+        ("dqn", "full"),
+        ("ppo", "paper"),
+        ("pqn", "paper"),
+        pytest.param("dqn", "paper", marks=pytest.mark.full),
+    ],
 )
 def test_a_stopped_run_of_any_algorithm_is_resumed_with_the_same_bits(tmp_path, algorithm, observation):
     settings = {"ppo": {"n_steps": 32, "batch_size": 32}, "pqn": {"n_envs": 4, "n_steps": 8, "batch_size": 16}}

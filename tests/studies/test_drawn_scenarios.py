@@ -143,8 +143,15 @@ def test_an_episode_that_ends_is_followed_by_one_in_a_fresh_scenario(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("observation", ["full", "paper"])
-@pytest.mark.parametrize("name", ["dqn", "pqn"])
+@pytest.mark.parametrize(
+    ("name", "observation"),
+    [
+        ("dqn", "full"),
+        pytest.param("dqn", "paper", marks=pytest.mark.full),
+        pytest.param("pqn", "full", marks=pytest.mark.full),
+        ("pqn", "paper"),
+    ],
+)
 def test_q_learning_on_drawn_scenarios(tmp_path, name, observation):
     text = text_of(name).replace('observation = "full"', f'observation = "{observation}"')
     results = run_study(study_of(text), tmp_path / "run")
