@@ -1,0 +1,114 @@
+"""What fuzzing found (experiments/fuzz.py), one test each; classes of input have theirs in the rooms."""
+
+import json
+import sqlite3
+import struct
+from contextlib import closing
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import uavmec_jax as um
+from tests.scenarios.test_state_files import CAPACITY, state_of
+from tests.search.test_folder import begun, refusal  # noqa: F401  (a fixture)
+from tests.search.test_search import space  # noqa: F401  (a fixture)
+from uavmec_jax.cluster.options import RayOptions
+from uavmec_jax.env.generator import ScenarioDistribution, sample_scenario
+from uavmec_jax.env.layout import pad_layout
+from uavmec_jax.errors import ArgumentError, StateError, StudyError
+from uavmec_jax.files.archives import read_checked, write_checked
+from uavmec_jax.planning.plan import make_plan
+from uavmec_jax.runs.run_plan import plan_run
+from uavmec_jax.runs.simulate import simulate
+from uavmec_jax.scenarios.seeds import held_out_draws, layout_for_seed
+from uavmec_jax.search.folder import DATABASE, FACTS
+from uavmec_jax.training.chunks import Validation
+
+PARAMS = um.Params()
+LAYOUT = um.sample_layout(jax.random.key(0), PARAMS, 8, 8)
+
+
+def test_names_in_a_database_that_are_not_utf8(space, begun):  # noqa: F811
+    """sqlite3 raised OperationalError where it made text of them."""
+    with closing(sqlite3.connect(begun / DATABASE)) as connection, connection:
+        connection.execute("UPDATE studies SET study_name = CAST(X'FF00' AS TEXT)")
+    assert "trials.db: cannot be used: Could not decode to UTF-8 column" in refusal(space, begun)
+
+
+def test_a_search_with_a_bad_database_writes_nothing(space, begun):  # noqa: F811
+    """The label was written before the database was opened."""
+    facts = (begun / FACTS).read_text()
+    (begun / DATABASE).write_bytes(b"SQLite no more" * 1000)
+    (begun / FACTS).write_text(json.dumps(json.loads(facts), indent=7))
+    before = (begun / FACTS).read_bytes()
+    assert "trials.db: cannot be used" in refusal(space, begun)
+    assert (begun / FACTS).read_bytes() == before
+
+
+def test_an_offset_in_front_of_an_archives_beginning_is_damage(tmp_path):
+    """It is an OSError, EINVAL, and was taken for a fault of the disk."""
+    path = tmp_path / "x.npz"
+    write_checked(path, 1, {}, {"a": np.arange(3)})
+    content = bytearray(path.read_bytes())
+    end = content.rindex(b"PK\x05\x06")
+    content[end + 12 : end + 20] = struct.pack("<II", len(content), 2**32 - 2)
+    path.write_bytes(content)
+    with pytest.raises(StudyError, match=r"x\.npz: ") as refused:
+        read_checked(path, 1, "a test", StudyError)
+    assert not isinstance(refused.value.__cause__, OSError)
+
+
+def test_a_battery_that_is_0_in_single_precision():
+    with pytest.raises(StateError, match=r"battery_j is 9.99989e-321; give more than 0"):
+        state_of({"battery_j": [1e-320, *CAPACITY[1:]]})
+
+
+@pytest.mark.parametrize(
+    ("call", "name"),
+    [
+        (lambda: RayOptions("local", cpus_per_shard=0), "cpus_per_shard"),
+        (lambda: RayOptions("local", retries=10**30), "retries"),
+        (lambda: RayOptions("local", time_limit_s=float("nan")), "time_limit_s"),
+        (lambda: trained(Validation(draws=0)), r"validation\.draws"),
+        (lambda: trained(Validation(every=-4)), r"validation\.every"),
+        (lambda: pad_layout(LAYOUT, 10**9), "size"),
+        (lambda: layout_for_seed(2**40, PARAMS, 8, 8), "seed"),
+        (lambda: held_out_draws(0, 8, 8, 10**9), "draws"),
+        (lambda: sample_scenario(bad_distribution(), jax.random.key(0)), r"distribution\.traffic_weights"),
+    ],
+)
+def test_numbers_without_bounds(call, name):
+    """What raised something else, allocated gigabytes or computed nonsense is one line that names the argument."""
+    with pytest.raises(ArgumentError, match=f"^{name} "):
+        call()
+
+
+def trained(validation):
+    scenarios = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], um.make_scenario(LAYOUT))
+    return um.train("ppo", scenarios, key=jax.random.key(0), steps=1, validation=validation)
+
+
+def bad_distribution():
+    return ScenarioDistribution(
+        params=PARAMS, reward=um.make_reward({"log A": 1.0}), traffic_weights=jnp.array([jnp.nan, 1.0])
+    )
+
+
+@pytest.mark.parametrize(("devices", "speed"), [(-1, 100.0), (10**9, 100.0), (10, float("inf")), (10, 0.0)])
+def test_a_simulation_of_no_machine(devices, speed):
+    study = um.load_study("table5")
+    with pytest.raises(ArgumentError, match=r"^(devices|speed) is "):
+        simulate(study, plan_run(study), speed=speed, devices=devices)
+
+
+@pytest.mark.slow
+def test_a_plan_of_a_layout_of_numpy_arrays():
+    """Changes were made with JAX's ``.at``, which NumPy's arrays do not have."""
+    draws = jax.random.key(0)[None]
+    of_jax, of_numpy = (
+        make_plan(PARAMS, layout, draws, width=2) for layout in (LAYOUT, jax.tree.map(np.asarray, LAYOUT))
+    )
+    assert of_numpy.what_if == of_jax.what_if
+    assert len(of_numpy.what_if) > 0
