@@ -268,7 +268,7 @@ def test_all_variants_together_train_on_drawn_scenarios(observation):
 
 @pytest.mark.slow
 @pytest.mark.bits
-@pytest.mark.parametrize("make", [drawing_agent, fixed_agent])
+@pytest.mark.parametrize("make", [drawing_agent, pytest.param(fixed_agent, marks=pytest.mark.full)])
 def test_a_batched_agent_is_the_agent_alone(make):
     """Its place in the batch changes no bit, and alone it acts in the same way."""
     agents = [make(seed) for seed in range(4)]

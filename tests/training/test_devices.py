@@ -36,7 +36,7 @@ print(hashlib.sha256(b"".join(np.ascontiguousarray(leaf).tobytes() for leaf in l
 
 @pytest.mark.slow
 @pytest.mark.bits
-@pytest.mark.parametrize("algorithm", ["dqn", "pqn"])
+@pytest.mark.parametrize("algorithm", ["dqn", pytest.param("pqn", marks=pytest.mark.full)])
 def test_the_same_bits_on_one_two_and_four_devices(algorithm):
     command = [sys.executable, "-c", SCRIPT]
     runs = [

@@ -35,7 +35,7 @@ def _checks_action(step: Callable) -> Callable:
 
     @wraps(step)
     def checked(self: "UavMecEnv", key: Any, state: State, action: Any, params: Scenario | None = None) -> Any:
-        check_action(action, Params().n_devices if params is None else params.layout.n_places)
+        check_action(action, Params.n_devices if params is None else params.layout.n_places)
         return settled(step(self, key, state, action, params))
 
     return checked
