@@ -67,8 +67,8 @@ def make_call(name: str, rng: Random) -> HostileCall:
     call = CALLS[name]
     arguments = dict(_arguments(name))
     places, reasons = [], []
-    for _ in range(rng.choice((1, 1, 1, 2))):
-        key = rng.choice([key for key in arguments if key not in call.fixed])
+    free = [key for key in arguments if key not in call.fixed]
+    for key in rng.sample(free, min(rng.choice((1, 1, 1, 2)), len(free))):
         arguments[key], place, reason = hostile(rng, arguments[key], key, call.ranges.get(key))
         places.append(place)
         reasons.append(reason if reason == OTHER_TYPE or call.checks or key in call.ranges else "")

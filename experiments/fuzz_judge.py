@@ -32,7 +32,7 @@ MEMORY_BYTES = 300e6
 INFINITE = frozenset({"uplink_rate_bit_s", "window_s", "pads", "packs"})
 """Fields whose infinity is documented: there is no limit."""
 
-UNKNOWN = frozenset({"failure_slot"})
+UNKNOWN = frozenset({"failure_slot", "returns_in", "returns_in_s", "low", "high"})
 """Fields whose NaN is documented: there is no such number."""
 
 _CLEAR, _STATUS = Path("/proc/self/clear_refs"), Path("/proc/self/status")

@@ -71,13 +71,12 @@ def _hostile_array(rng: Random, old: Any, name: str, allowed: Range | None) -> t
         return wrong, f"{name} = {str(wrong)[:60]}", OTHER_TYPE
     array, what = np.array(old), rng.random()
     if what < 0.6 and array.size:
-        number = rng.choice(_SMALL)
-        whole = array.dtype.kind in "iu"
-        if whole and (not isinstance(number, int) or abs(number) >= 2**31):
-            array = array.astype(object if isinstance(number, int) else float)
+        number = rng.choice([one for one in _SMALL if abs(one) < 2**63 or not isinstance(one, int)])
+        if array.dtype.kind in "iu" and (not isinstance(number, int) or abs(number) >= 2**31):
+            array = array.astype(np.int64 if isinstance(number, int) else float)
         with np.errstate(all="ignore"):
             array.reshape(-1)[rng.randrange(array.size)] = number
-        given = array if array.dtype == object or rng.random() < 0.5 else jnp.asarray(array)
+        given = array if rng.random() < 0.5 else jnp.asarray(array)
         changed = float(np.asarray(given, float).reshape(-1)[0]) if array.size == 1 else float(number)
         reason = "" if old.dtype == bool else _reason(changed, name, allowed)
         return given, f"{name} has {number!r} ({given.dtype})", reason

@@ -30,6 +30,7 @@ if os.environ.pop("PYTHONDONTWRITEBYTECODE", ""):
     sys.dont_write_bytecode = False
 
 import jax
+import jaxtyping
 import psutil
 import pytest
 from jaxtyping import install_import_hook
@@ -52,3 +53,11 @@ def _bounded_memory():
     if psutil.Process().memory_info().rss > _MAX_RESIDENT_BYTES:
         jax.clear_caches()
         gc.collect()
+
+
+@pytest.fixture
+def without_type_checks():
+    """Run a test as users run the package, without the type checker of the tests."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)

@@ -1,9 +1,11 @@
 """What fuzzing found (experiments/fuzz.py), one test each; classes of input have theirs in the rooms."""
 
 import json
+import math
 import sqlite3
 import struct
 from contextlib import closing
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -17,17 +19,24 @@ from tests.search.test_search import space  # noqa: F401  (a fixture)
 from uavmec_jax.cluster.options import RayOptions
 from uavmec_jax.env.generator import ScenarioDistribution, sample_scenario
 from uavmec_jax.env.layout import pad_layout
-from uavmec_jax.errors import ArgumentError, StateError, StudyError
+from uavmec_jax.errors import ArgumentError, PolicyError, StateError, StudyError
 from uavmec_jax.files.archives import read_checked, write_checked
 from uavmec_jax.planning.plan import make_plan
+from uavmec_jax.runs.options import RunOptions
 from uavmec_jax.runs.run_plan import plan_run
 from uavmec_jax.runs.simulate import simulate
+from uavmec_jax.scenarios.named_scenario import name_scenario
+from uavmec_jax.scenarios.places import on_place
+from uavmec_jax.scenarios.scenario_files import scenario_text
 from uavmec_jax.scenarios.seeds import held_out_draws, layout_for_seed
 from uavmec_jax.search.folder import DATABASE, FACTS
 from uavmec_jax.training.chunks import Validation
 
 PARAMS = um.Params()
 LAYOUT = um.sample_layout(jax.random.key(0), PARAMS, 8, 8)
+STATE = um.initial_state(PARAMS, LAYOUT)
+VOLUMES = jnp.full(12, 3e6)
+NAMED = name_scenario(LAYOUT, PARAMS, "x")
 
 
 def test_names_in_a_database_that_are_not_utf8(space, begun):  # noqa: F811
@@ -94,6 +103,43 @@ def bad_distribution():
     return ScenarioDistribution(
         params=PARAMS, reward=um.make_reward({"log A": 1.0}), traffic_weights=jnp.array([jnp.nan, 1.0])
     )
+
+
+@pytest.mark.usefixtures("without_type_checks")
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: um.sample_layout(jax.random.key(0), um.Params(device_battery_range_j=1e5), 0, 0),
+        lambda: RunOptions(checkpoint_every_s="60"),
+        lambda: RunOptions(checkpoint_share=1j),
+        lambda: um.env.make_depots(np.zeros((1, 2), complex)),
+        lambda: um.transition(PARAMS.replace(bandwidth_hz=2**63), LAYOUT, STATE, 0, VOLUMES),
+        lambda: um.transition(PARAMS.replace(uav_altitude_m=2**31 - 1), LAYOUT, STATE, 0, VOLUMES),
+        lambda: um.transition(PARAMS, LAYOUT, STATE.replace(slot=2**63), 0, VOLUMES),
+        lambda: um.transition(PARAMS, LAYOUT, STATE, [[1], [2, 3]], VOLUMES),
+        lambda: on_place(LAYOUT, um.traffic.load_evacuation("albany"), moving=float("nan")),
+        lambda: scenario_text(replace(NAMED, params=PARAMS.replace(region_m=(800.0, -math.inf)))),
+    ],
+)
+def test_values_of_another_kind(call):
+    """These raised TypeError or OverflowError, or were taken as they were."""
+    with pytest.raises(ArgumentError) as refused:
+        call()
+    assert "\n" not in str(refused.value)
+
+
+def test_a_layout_of_numpy_arrays_is_played():
+    """A traced action is no index of NumPy's."""
+    layouts = LAYOUT, jax.tree.map(np.asarray, LAYOUT)
+    policy = um.planning.HEURISTICS["oldest-first"]
+    of_jax, of_numpy = (um.rollout(policy, PARAMS, layout, jax.random.key(0)).length for layout in layouts)
+    assert of_jax == of_numpy
+
+
+def test_an_observation_of_complex_numbers():
+    policy = um.load_policy("generalist")
+    with pytest.raises(PolicyError, match="the observation is not an array of numbers"):
+        policy.act(np.zeros((12, 9), complex))
 
 
 @pytest.mark.parametrize(("devices", "speed"), [(-1, 100.0), (10**9, 100.0), (10, float("inf")), (10, 0.0)])

@@ -108,7 +108,7 @@ PARSERS = {
 }
 
 OPENS_ITS_OWN = {
-    "runs.log": {"path.open"},  # appends to its own log
+    "runs.log": {"os.open", "os.fdopen"},  # appends to its own log
     "studies.results_files": {"pd.read_csv"},  # of bytes that were read in `files`
     "traffic.worker": {"Path(sys.argv[1]).read_text", "ElementTree.parse"},  # SUMO's child process, on our own files
     "training.host": {"open", "file.read_bytes"},  # /proc/cpuinfo; the package's own source

@@ -52,8 +52,8 @@ def test_devices_are_counted_from_1(refused, devices):
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        (("run", "table5", "--checkpoint-every", "nan"), "--checkpoint-every is nan; give a number from 0 to 3.1536e+07"),
-        (("run", "table5", "--checkpoint-every", "inf"), "--checkpoint-every is inf; give a number from 0 to 3.1536e+07"),
+        (("run", "table5", "--checkpoint-every", "nan"), "--checkpoint-every is nan; give a number from 0 to 31,536,000"),
+        (("run", "table5", "--checkpoint-every", "inf"), "--checkpoint-every is inf; give a number from 0 to 31,536,000"),
         (("run", "table5", "--checkpoint-share", "nan"), "--checkpoint-share is nan; give a number from 0.001 to 1"),
         (("run", "table5", "--shard-size", "0"), "--shard-size is 0; give a whole number from 1 to 1000000000"),
         (("run", "table5", "--ray", "local", "--time-limit", "nan"), "--time-limit is nan; give a number from 1 to"),
@@ -63,7 +63,7 @@ def test_devices_are_counted_from_1(refused, devices):
         (("run", "table5", "--seeds", "1.5"), "--seeds is '1.5'; give a whole number from 1 to 2147483647"),
         (("run", "table5", "--steps", "2000000001"), "--steps is 2000000001; give a whole number from 1 to 2000000000"),
         (("search", "dqn", "--trials", "0"), "--trials is 0; give a whole number from 1 to 100000"),
-        (("advise", "--price", "nan"), "--price is nan; give a number from 0 to 1e+09"),
+        (("advise", "--price", "nan"), "--price is nan; give a number from 0 to 1,000,000,000"),
         (("advise", "--samples", "1"), "--samples is 1; give a whole number from 2 to 100000"),
         (("plan", "--seed", "-1"), "--seed is -1; give a whole number from 0 to 2147483647"),
         (("plan", "--uavs", "101"), "--uavs is 101; give a whole number from 1 to 100"),
@@ -121,9 +121,9 @@ def test_what_cannot_be_a_path_is_refused(refused, arguments):
     def line(path):
         return refused(*(path if argument == "{}" else argument for argument in arguments))
 
-    assert line("a\0b.toml").endswith(r"is 'a\x00b.toml'; it holds a NUL character, which no path can")
+    assert line("a\0b.toml").endswith(r"is 'a\x00b.toml'; it contains a NUL character, which no path can contain")
     assert line("").endswith("is empty; give a path or a name")
-    assert "it has 100,000 characters; a path has at most 4,095 bytes" in line("x" * 100_000)
+    assert "it has 100,000 bytes; a path has at most 4,095" in line("x" * 100_000)
     assert "and each name in it at most 255" in line("ä" * 128)
     assert "holds bytes that are not UTF-8" in line(os.fsdecode(b"\xff.toml"))
 

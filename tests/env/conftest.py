@@ -1,7 +1,6 @@
 """Fixtures of the tests of the environment."""
 
 import jax
-import jaxtyping
 import pytest
 
 
@@ -10,11 +9,3 @@ def with_and_without_jit(request):
     """Run a test twice: with ``jax.jit`` as the code says, and with all functions evaluated operation by operation."""
     with jax.disable_jit(request.param == "no-jit"):
         yield
-
-
-@pytest.fixture
-def without_type_checks():
-    """Run a test as users run the package, without the type checker of the tests."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)

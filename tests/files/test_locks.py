@@ -9,7 +9,7 @@ import pytest
 from tests.runs.processes import environment
 from uavmec_jax.errors import StudyError
 from uavmec_jax.files import locks
-from uavmec_jax.files.locks import OWNER, is_known_dead, lock_folder, owner_of, this_process
+from uavmec_jax.files.locks import OWNER, describe_process, is_known_dead, lock_folder, owner_of, this_process
 
 HOLD = """
 import sys, time
@@ -108,3 +108,14 @@ def test_a_reused_process_number_is_no_owner(monkeypatch):
     monkeypatch.setattr(locks, "_born", lambda pid: "another")
     assert is_known_dead(process)
     assert not is_known_dead(process | {"machine": "elsewhere 1"})
+
+
+@pytest.mark.parametrize("pid", ["x", 10**30, -1, True, None, 1.5])
+def test_an_owner_with_a_number_that_no_process_has_is_dead(tmp_path, pid):
+    (tmp_path / OWNER).write_text(json.dumps({"machine": locks.this_machine(), "pid": pid}))
+    assert owner_of(tmp_path) is None
+
+
+@pytest.mark.parametrize("owner", [{}, {"machine": ""}, {"machine": None}, {"machine": " "}])
+def test_an_owner_that_names_no_machine(owner):
+    assert describe_process(owner) == "process ? on an unknown machine"

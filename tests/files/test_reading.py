@@ -60,7 +60,9 @@ def test_a_name_that_no_file_can_have_is_refused(tmp_path, name):
 
 def test_a_nul_in_a_location_is_refused():
     for convert in (to_path, lambda path: local_path(path, "a search")):
-        with pytest.raises(StudyError, match=r"a\\x00b: holds a NUL character, which no path can; give another path"):
+        with pytest.raises(
+            StudyError, match=r"a\\x00b: contains a NUL character, which no path can contain; give another path"
+        ):
             convert("a\0b")
 
 

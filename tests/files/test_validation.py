@@ -59,6 +59,10 @@ ERRORS = {
     "infinite": ({"wheels": 4, "engine": {"power_w": math.inf}}, "engine.power_w is inf; it should be a finite number"),
     "union": ({"wheels": 4, "mirrors": 2.5}, "car.toml: mirrors is 2.5; it should be a valid integer"),
     "key": ({"wheels": 4, "engin": {}}, "car.toml: engin is not a setting; did you mean 'engine'?"),
+    "key called like a type": (
+        {"wheels": 4, "engine": {"float": 1.0}},
+        "car.toml: engine.float is not a setting; did you mean 'fuel'? known: power_w, fuel",
+    ),
     "unlike key": (
         {"wheels": 4, "q": 1},
         "car.toml: q is not a setting; known: wheels, mirrors, engine, spare_engine, origin, seat, doors, routes, cabin",

@@ -129,7 +129,7 @@ def test_reports_that_are_something_else_do_no_harm(folders, half, name, content
     assert bits(half) == bits(folders / "whole")
 
 
-@pytest.mark.parametrize("name", ["shards", "shards/00001", "log"])
+@pytest.mark.parametrize("name", ["shards", "shards/00001", "log", "tensorboard"])
 def test_a_link_that_leads_out_of_the_folder_is_refused(half, tmp_path, name):
     victim = tmp_path / "victim"
     victim.mkdir()

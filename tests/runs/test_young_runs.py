@@ -145,7 +145,7 @@ def test_a_file_of_another_run_is_one_line(folders, copied, name, command):
         (("plan", "agents"), 5, "plan.agents is 5; the parts have 4"),
         (("options", "checkpoint"), "none", "options.checkpoint is 'none'"),
         (("options", "checkpoint_every_s"), -1.0, "options.checkpoint_every_s is -1.0"),
-        (("label", "seeds"), [0, 7], "seeds are others than those of the study file"),
+        (("label", "seeds"), [0, 7], "seeds differ from those of the study file"),
         (("label", "places"), {"albany": {}}, "label.places.albany.place is missing"),
         (("versions",), ["jax"], "versions is ['jax']"),
     ],

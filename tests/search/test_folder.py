@@ -153,7 +153,7 @@ def a_folder(path):
     path.mkdir()
 
 
-OTHERS = "trials.db: holds the trials of something else than space; give another folder with --out"
+OTHERS = "trials.db: holds the trials of something other than space; give another folder with --out"
 
 
 @pytest.mark.parametrize(

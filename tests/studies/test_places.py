@@ -124,7 +124,7 @@ def test_traffic_without_a_place_is_refused():
 
 def test_a_layout_of_another_size_than_the_place_is_refused():
     layout = sample_layout(jax.random.key(0), Params(n_devices=5), 2, 2)
-    with pytest.raises(ArgumentError, match=r"^layout has 5 devices; albany has 12, give a layout of as many$"):
+    with pytest.raises(ArgumentError, match=r"^layout has 5 devices; it should have those of albany, 12$"):
         on_place(layout, load_evacuation("albany"))
 
 

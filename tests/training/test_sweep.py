@@ -115,7 +115,7 @@ def test_a_scenario_that_cannot_be_is_refused(scenarios):
 
 
 def test_one_scenario_is_not_a_batch(scenarios):
-    with pytest.raises(AssertionError, match="rank"):
+    with pytest.raises(um.ArgumentError, match=r"scenarios\.layout\.capacity has shape"):
         um.train("dqn", take(scenarios, 0), key=jax.random.key(0), steps=100)
 
 

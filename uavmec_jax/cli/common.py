@@ -87,7 +87,7 @@ def print_line(text: str, *, err: bool = False) -> None:
 
 def warn(line: str) -> None:
     """Print a warning on standard error."""
-    print_line(f"uavmec: warning: {one_line(line)}", err=True)
+    print_line(one_line(f"uavmec: warning: {line}"), err=True)
 
 
 def print_json(data: Any) -> None:

@@ -39,7 +39,7 @@ def check_location(location: object, param: click.Parameter | None) -> None:
     if not text:
         raise InputError(f"{name_of(param)} is empty; give a path or a name")
     if "\0" in text:
-        raise InputError(f"{name_of(param)} is {text!r}; it holds a NUL character, which no path can")
+        raise InputError(f"{name_of(param)} is {text!r}; it contains a NUL character, which no path can contain")
     if not is_utf8(text):
         raise InputError(
             f"{name_of(param)} is {text!r}; it holds bytes that are not UTF-8; give a file with another name"
@@ -48,7 +48,7 @@ def check_location(location: object, param: click.Parameter | None) -> None:
     longest = 0 if is_url(text) else max(map(len, names))
     if sum(map(len, names)) + len(names) - 1 > _MAX_PATH_BYTES or longest > _MAX_NAME_BYTES:
         raise InputError(
-            f"{name_of(param)} is {text!r}; it has {len(text):,} characters; a path has at most {_MAX_PATH_BYTES:,} bytes, "
+            f"{name_of(param)} is {text!r}; it has {len(text.encode()):,} bytes; a path has at most {_MAX_PATH_BYTES:,}, "
             f"and each name in it at most {_MAX_NAME_BYTES}"
         )
 
@@ -135,7 +135,7 @@ class FiniteRange(click.FloatRange):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Return the number, and refuse what is none or out of bounds."""
-        return _within(self, float, value, param, f"a number from {self.min:g} to {self.max:g}")
+        return _within(self, float, value, param, f"a number from {self.min:g} to {self.max:,.10g}")
 
 
 def given(*names: str) -> list[str]:

@@ -163,7 +163,7 @@ def check_action(action: Any, n_places: int, axes: tuple[str, ...] = ("UAV",)) -
         ArgumentError: one line. A traced action passes, which :func:`transition` clamps; see :func:`debug_checks`.
     """
     number = action
-    if type(action) is not int and not isinstance(action, jax.core.Tracer):
+    if isinstance(action, np.ndarray | np.generic | jax.Array) and not isinstance(action, jax.core.Tracer):
         array = np.asarray(action)
         number = array.item() if array.size == 1 and array.dtype.kind in "iu" else None
     if type(number) is int and 0 <= number < n_places:

@@ -5,20 +5,22 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
-from uavmec_jax.env.checks import LARGEST, POSITION, Bounds, Check, action_check, check_ranges, volumes_check
+from uavmec_jax.env.checks import action_check, check_ranges, volumes_check
 from uavmec_jax.env.depots import can_help, serve_landed, stands_at
 from uavmec_jax.env.fleet import Fleet
 from uavmec_jax.env.layout import Layout, fleet_of
-from uavmec_jax.env.params import Params
+from uavmec_jax.env.params import Params, check_params
 from uavmec_jax.env.scenario_checks import check_scenario
 from uavmec_jax.env.slot import Flights, Services, plan_flights, services_of, who_starts
+from uavmec_jax.env.state_checks import state_checks
 from uavmec_jax.env.types import Scalar
+from uavmec_jax.errors import ArgumentError
 
 
 class Cause(enum.IntEnum):
@@ -177,17 +179,13 @@ def transition(
         happens in it, and the cause is :attr:`Cause.UAV`; under ``end = "horizon"`` it goes on without UAVs.
 
     Raises:
-        ArgumentError: the action, a volume or an energy is out of range; one line. Traced ones are checked only inside
-            :func:`um.debug_checks`.
+        ArgumentError: a shape is wrong, or the action, a volume or a value of the parameters or the state is out of range;
+            one line. Traced values are checked only inside :func:`um.debug_checks`.
     """
-    n = layout.n_devices
-    chex.assert_shape([layout.capacity, state.battery, state.age, volumes], (n,))
-    _check_slot(layout, state, action, volumes)
+    _check_slot(params, layout, state, action, volumes)
     state, fleet = complete_state(layout, state), fleet_of(params, layout)
     living = living_devices(params, layout, state)
-    target = jnp.atleast_1d(action)
-    chex.assert_shape(target, (layout.n_uavs,))
-    target = jnp.clip(target, 0, layout.n_places - 1)
+    target = jnp.clip(jnp.atleast_1d(action), 0, layout.n_places - 1)
     flights = plan_flights(params, layout, fleet, state.uav_position, target, volumes)
     services = partial(services_of, params, fleet, flights, living)
 
@@ -208,18 +206,20 @@ def transition(
     return after, _outcome(params, layout, state, after, happens, slot, drain, living)
 
 
-def _check_slot(layout: Layout, state: State, action: Any, volumes: Any) -> None:
-    """Check what goes into a slot."""
-    energy = Bounds(ge=0, le=LARGEST)
-    check_ranges(
-        [
-            action_check(action, layout.n_places),
-            volumes_check(volumes),
-            Check("state.battery", state.battery, energy, ("device",)),
-            Check("state.uav_energy", state.uav_energy, energy, ("UAV",)),
-            Check("state.uav_position", state.uav_position, POSITION, ("UAV", "")),
-        ]
-    )
+def _check_slot(params: Params, layout: Layout, state: State, action: Any, volumes: Any) -> None:
+    """Check what goes into a slot: shapes, and the values that are known."""
+    check_params(params)
+    check_ranges([action_check(action, layout.n_places), volumes_check(volumes), *state_checks(state)])
+    n, uavs = layout.n_devices, layout.n_uavs
+    for name, value, shape, what in (
+        ("layout.capacity", layout.capacity, (n,), "one per device"),
+        ("state.battery", state.battery, (n,), "one per device"),
+        ("state.age", state.age, (n,), "one per device"),
+        ("volumes", volumes, (n,), "one per device"),
+        ("action", action, (uavs,) if uavs > 1 or np.ndim(action) else (), "one place per UAV"),
+    ):
+        if np.shape(value) != shape:
+            raise ArgumentError(f"{name} has shape {np.shape(value)}; it should be {shape}, {what}")
 
 
 def _helped(layout: Layout, state: State) -> Bool[Array, ""]:

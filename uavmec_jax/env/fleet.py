@@ -10,7 +10,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from uavmec_jax.env.checks import LARGEST, POSITION, Bounds, Check, check_range, check_ranges
+from uavmec_jax.env.checks import LARGEST, MAX_LENGTH_M, POSITION, Bounds, Check, check_range, check_ranges
 from uavmec_jax.env.params import Params
 from uavmec_jax.errors import ArgumentError
 
@@ -77,7 +77,10 @@ UAV_FIELDS = ("speed_m_s", "flying_power_w", "hovering_power_w", "battery_j", "s
 
 
 _POSITIVE, _NOT_NEGATIVE = Bounds(gt=0, le=LARGEST), Bounds(ge=0, le=LARGEST)
-FLEET_BOUNDS = dict.fromkeys(UAV_FIELDS, _POSITIVE) | {"flying_power_w": _NOT_NEGATIVE}
+FLEET_BOUNDS = dict.fromkeys(UAV_FIELDS, _POSITIVE) | {
+    "flying_power_w": _NOT_NEGATIVE,
+    "signal_range_m": Bounds(gt=0, le=MAX_LENGTH_M),
+}
 """Ranges of the fields of a :class:`Fleet`."""
 
 DEPOT_BOUNDS = {"pads": Bounds(ge=1, infinite=True), "packs": Bounds(ge=0, infinite=True), "power_w": _NOT_NEGATIVE}
@@ -135,7 +138,7 @@ def make_depots(
         ArgumentError: a kind is unknown, a number is out of range, or there are too few or too many, one line that names the
             field.
     """
-    position = jnp.asarray(position, jnp.float32).reshape(-1, 2)
+    position = _real("position", position).reshape(-1, 2)
     count = position.shape[0]
     kinds = [kind] * count if isinstance(kind, str) else list(kind)
     if len(kinds) != count:
@@ -162,8 +165,15 @@ def default_start(uavs: int, depots: Depots | None) -> Float[Array, "K 2"]:
 
 def _one_each(name: str, value: Any, shape: tuple[int, ...], dtype: Any = jnp.float32) -> Array:
     """Return one value for each UAV or depot, given one for all or one for each."""
-    with np.errstate(over="ignore"):  # what is too large becomes infinite, which is refused
-        array = jnp.asarray(value, dtype)
+    array = _real(name, value, dtype)
     if array.shape not in (shape, shape[1:]):
         raise ArgumentError(f"{name} has shape {array.shape}; it should be {shape}, or {shape[1:]} for all alike")
     return jnp.broadcast_to(array, shape)
+
+
+def _real(name: str, value: Any, dtype: Any = jnp.float32) -> Array:
+    """Return a value as an array of real numbers; what is too large becomes infinite, which checks refuse."""
+    if np.iscomplexobj(value):
+        raise ArgumentError(f"{name} is complex; it should be real numbers")
+    with np.errstate(over="ignore"):
+        return jnp.asarray(value, dtype)

@@ -102,7 +102,9 @@ class Layout:
 
     def places(self) -> Float[Array, "n_places 2"]:
         """Return the positions of all places in m, without batch axes."""
-        return self.position if self.depots is None else jnp.concatenate([self.position, self.depots.position])
+        if self.depots is None:
+            return jnp.asarray(self.position)
+        return jnp.concatenate([self.position, self.depots.position])
 
     def service_weight(self) -> Float[Array, "*batch n"]:
         """Return the weight of each device in measures of service: its priority, 1 by default; padding weighs nothing."""

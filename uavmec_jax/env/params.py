@@ -129,6 +129,9 @@ def check_params(params: Params, name: str = "params") -> None:
             checks.append(Check(f"{name}.{field}", value, bounds))
     check_ranges(checks)
     for field in _RISING:
-        low, high = getattr(params, field)
+        value = getattr(params, field)
+        if not isinstance(value, tuple | list) and np.shape(value)[:1] != (2,):
+            raise ArgumentError(f"{name}.{field} is {value!r}; it should be (low, high)")
+        low, high = value
         if not is_traced((low, high)) and np.any(np.asarray(low) > np.asarray(high)):
             raise ArgumentError(f"{name}.{field} is ({low}, {high}); it should be (low, high) with low <= high")

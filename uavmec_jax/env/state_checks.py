@@ -1,11 +1,27 @@
 """Checks of states; see :mod:`uavmec_jax.env.checks`."""
 
+from typing import Any
+
 from uavmec_jax.env.checks import LARGEST, POSITION, Bounds, Check, check_ranges, check_shape
-from uavmec_jax.env.dynamics import State
 from uavmec_jax.env.layout import Layout
 
+_ENERGY = Bounds(ge=0, le=LARGEST)
+_WHOLE = Bounds(ge=0, lt=2**31, whole=True)
 
-def check_state(layout: Layout, state: State, name: str = "state") -> None:
+
+def state_checks(state: Any, name: str = "state") -> list[Check]:
+    """Return the checks of all values of a :class:`State`."""
+    return [
+        Check(f"{name}.battery", state.battery, _ENERGY, ("device",)),
+        Check(f"{name}.age", state.age, _WHOLE, ("device",)),
+        Check(f"{name}.uav_energy", state.uav_energy, _ENERGY, ("UAV",)),
+        Check(f"{name}.uav_position", state.uav_position, POSITION, ("UAV", "")),
+        Check(f"{name}.slot", state.slot, _WHOLE),
+        Check(f"{name}.elapsed", state.elapsed, Bounds(ge=0, le=LARGEST)),
+    ]
+
+
+def check_state(layout: Layout, state: Any, name: str = "state") -> None:
     """Check every value of a state that is known, and that it fits its layout.
 
     Raises:
@@ -19,14 +35,4 @@ def check_state(layout: Layout, state: State, name: str = "state") -> None:
         ("uav_position", (uavs, 2), "x and y of each UAV"),
     ):
         check_shape(f"{name}.{field}", getattr(state, field), shape, what)
-    energy = Bounds(ge=0, le=LARGEST)
-    check_ranges(
-        [
-            Check(f"{name}.battery", state.battery, energy, ("device",)),
-            Check(f"{name}.age", state.age, Bounds(ge=0, whole=True), ("device",)),
-            Check(f"{name}.uav_energy", state.uav_energy, energy, ("UAV",)),
-            Check(f"{name}.uav_position", state.uav_position, POSITION, ("UAV", "")),
-            Check(f"{name}.slot", state.slot, Bounds(ge=0, whole=True)),
-            Check(f"{name}.elapsed", state.elapsed, Bounds(ge=0, le=LARGEST)),
-        ]
-    )
+    check_ranges(state_checks(state, name))

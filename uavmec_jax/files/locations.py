@@ -12,7 +12,6 @@ import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, cast
 
@@ -48,7 +47,7 @@ def to_path(location: str | Path, error: type[UserError] = StudyError) -> Path:
     """
     text = str(location)
     if "\0" in text:
-        raise error(f"{text}: holds a NUL character, which no path can; give another path")
+        raise error(f"{text}: contains a NUL character, which no path can contain; give another path")
     if not is_url(text):
         if isinstance(location, Path) and _COLLAPSED_URL.match(text):
             raise error(f"{text}: looks like a URL that has lost a slash as a pathlib.Path; give it as text")
@@ -154,11 +153,6 @@ def names_in(folder: Path) -> list[str]:
     except FileNotFoundError:
         return []
     return sorted(names - {""})  # the empty object by which consoles of stores show a folder
-
-
-def files_matching(folder: Path, pattern: str) -> list[Path]:
-    """Return the files in a folder whose names match a pattern, sorted by name; none if the folder does not exist."""
-    return [folder / name for name in names_in(folder) if fnmatchcase(name, pattern)]
 
 
 def files_in_subfolders(folder: Path) -> Iterable[Path]:

@@ -45,14 +45,17 @@ def this_process() -> dict[str, Any]:
 
 def describe_process(process: dict[str, Any]) -> str:
     """Return a process in words."""
-    return f"process {process.get('pid', '?')} on {str(process.get('machine', 'an unknown machine')).split()[0]}"
+    machine = str(process.get("machine") or "").split() or ["an unknown machine"]
+    return f"process {process.get('pid', '?')} on {machine[0]}"
 
 
 def is_known_dead(process: dict[str, Any]) -> bool:
     """Return whether a process was one of this machine that has ended; its number may have been reused."""
     if process.get("machine") != this_machine():
         return False
-    pid = process.get("pid", -1)
+    pid = process.get("pid")
+    if type(pid) is not int or not 0 < pid < 2**31:  # not written by this package
+        return True
     return not psutil.pid_exists(pid) or process.get("born") != _born(pid)
 
 

@@ -148,10 +148,14 @@ def _lines(text: str, source: object, error: type[UserError]) -> Iterator[tuple[
     try:
         for cells in reader:
             if (longest := max(map(len, cells), default=0)) > MAX_CELL:
-                raise error(f"{source}: line {reader.line_num} has a cell of {longest} characters; at most {MAX_CELL}")
+                raise error(
+                    f"{source}: line {reader.line_num} has a cell of {longest:,} characters; give at most {MAX_CELL:,}"
+                )
             if any(cell.strip() for cell in cells):
                 yield reader.line_num, cells
     except csv.Error as problem:
+        if "field limit" in str(problem):
+            raise error(f"{source}: line {reader.line_num} has a longer cell than {MAX_CELL:,} characters") from None
         raise error(f"{source}: line {reader.line_num} is not CSV: {problem}") from None
 
 

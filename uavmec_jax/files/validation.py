@@ -19,7 +19,7 @@ from_array = BeforeValidator(lambda value: tuple(value) if isinstance(value, lis
 LARGEST = 1e12
 """Largest size of a number: far beyond any quantity in SI units, and far from overflow in float32."""
 
-SMALLEST = 1e-12
+LEAST_SIZE = 1e-12
 """Smallest size of a number that is not 0: in float32, what is much closer to 0 is 0, and divides to infinity."""
 
 LARGEST_WHOLE = 2**31 - 1
@@ -29,13 +29,13 @@ LARGEST_WHOLE = 2**31 - 1
 def _check_size(value: float) -> float:
     if LARGEST < abs(value) < math.inf:
         raise PydanticCustomError("too_large", f"Input should be at most {LARGEST:g} in size")
-    if 0 < abs(value) < SMALLEST:
-        raise PydanticCustomError("too_small", f"Input should be 0, or at least {SMALLEST:g} in size")
+    if 0 < abs(value) < LEAST_SIZE:
+        raise PydanticCustomError("too_small", f"Input should be 0, or at least {LEAST_SIZE:g} in size")
     return value
 
 
 usual_size = AfterValidator(_check_size)
-"""Checks that a number is 0, infinite where that is allowed, or of a size from :data:`SMALLEST` to :data:`LARGEST`."""
+"""Checks that a number is 0, infinite where that is allowed, or of a size from :data:`LEAST_SIZE` to :data:`LARGEST`."""
 
 _End = Annotated[float, Field(ge=0), usual_size]
 Range = Annotated[tuple[_End, _End], from_array]
@@ -148,6 +148,8 @@ def describe_error(source: str, error: pydantic.ValidationError, model: type[Bas
     if first["type"] == "value_error":
         return f"{source}: {expectation(first)}"
     location = _without_tags(first)
+    if first["type"] == "extra_forbidden":  # it may be called like a tag
+        location = [*_without_tags({**first, "loc": first["loc"][:-1]}), first["loc"][-1]]
     subject = f"{source}: {_in_words(location, model, data)}".rstrip()
     if first["type"] == "extra_forbidden":
         fields = _fields_at(model, first["loc"][:-1])

@@ -134,9 +134,7 @@ def instances(params: Params, layouts: Layout, volumes: Num[Array, "B H n"]) -> 
     batch = {name: np.asarray(leaf) for name, leaf in _quantities(params, layouts, volumes).items()}
     for name, leaf in batch.items():
         if leaf.dtype == np.float32 and np.isnan(leaf).any():
-            raise ArgumentError(
-                f"the scenario gives {name} that is not a number; its numbers are too large or too small"
-            )
+            raise ArgumentError(f"the scenario makes {name} NaN; its numbers are too large or too small")
     batch = {name: leaf.astype(float) if leaf.dtype == np.float32 else leaf for name, leaf in batch.items()}
     depots = None if layouts.depots is None else jax.tree.map(np.asarray, layouts.depots)
     for number in range(len(volumes)):

@@ -5,7 +5,7 @@ Whatever else lies among the shards (a copy that a synchronised folder has made,
 
 import re
 
-RUN_PLAN, LOG, SHARDS, TOUR = "run_plan.json", "log", "shards", "tour.json"
+RUN_PLAN, LOG, SHARDS, TENSORBOARD, TOUR = "run_plan.json", "log", "shards", "tensorboard", "tour.json"
 CHECKPOINT, PROGRESS, RESULT, FAILURE = "checkpoint", "progress", "result", "failed.json"
 """What an attempt at a shard writes, under its own name, and why the shard failed."""
 

@@ -23,6 +23,7 @@ from uavmec_jax.runs.file_names import (
     RESULT,
     RUN_PLAN,
     SHARDS,
+    TENSORBOARD,
     TOUR,
     is_named,
     is_ours,
@@ -212,7 +213,8 @@ class RunFolder:
         Raises:
             StudyError: one is.
         """
-        folders = [self.path / LOG, self.shards_folder, *(self.shard_folder(shard) for shard in self.plan.shards)]
+        folders = [self.path / name for name in (LOG, TENSORBOARD)]
+        folders += [self.shards_folder, *(self.shard_folder(shard) for shard in self.plan.shards)]
         for folder in folders if is_local(self.path) else ():
             if folder.is_symlink():
                 raise StudyError(

@@ -16,11 +16,14 @@ from typing import Any
 from uavmec_jax.files.extras import optional
 from uavmec_jax.files.locations import is_local
 from uavmec_jax.files.writing import write_text
+from uavmec_jax.runs.file_names import TENSORBOARD
 
 OnEvent = Callable[[str, dict[str, Any]], None]
 
 CHUNK = "chunk"
 """The event that carries a shard's curves."""
+
+_NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)
 
 
 class RunLog:
@@ -53,7 +56,7 @@ class RunLog:
         else:  # objects cannot be appended to: each log is one that is written anew
             self._logger.addHandler(_JsonObjectHandler(folder / f"{name}-{time.time_ns():x}.jsonl"))
         if tensorboard and is_local(folder):  # TensorBoard's own writer knows paths only
-            self._logger.addHandler(_TensorBoardHandler(folder.parent / "tensorboard"))
+            self._logger.addHandler(_TensorBoardHandler(folder.parent / TENSORBOARD))
         self._on_event = on_event
 
     def event(self, name: str, **facts: Any) -> None:
@@ -93,7 +96,8 @@ class _JsonLinesHandler(logging.FileHandler):
     def _open(self) -> Any:
         path = Path(self.baseFilename)
         path.parent.mkdir(parents=True, exist_ok=True)
-        return io.TextIOWrapper(path.open("ab", buffering=0), encoding=self.encoding, write_through=True)
+        descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | _NO_FOLLOW, 0o666)
+        return io.TextIOWrapper(os.fdopen(descriptor, "ab", buffering=0), encoding=self.encoding, write_through=True)
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 (the name is logging's)
         """Ignore a full disk: the run reports it when it writes its next checkpoint."""

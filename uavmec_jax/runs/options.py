@@ -34,9 +34,9 @@ class RunOptions:
     def __post_init__(self) -> None:
         if self.checkpoint not in CHECKPOINT_KINDS:
             raise ArgumentError(f"checkpoint is {self.checkpoint!r}; known: {', '.join(CHECKPOINT_KINDS)}")
-        if not 0 <= self.checkpoint_every_s < math.inf:
+        if not (isinstance(self.checkpoint_every_s, int | float) and 0 <= self.checkpoint_every_s < math.inf):
             raise ArgumentError(
                 f"checkpoint_every_s is {self.checkpoint_every_s!r}; give a finite number of seconds from 0"
             )
-        if not 0 < self.checkpoint_share <= 1:
+        if not (isinstance(self.checkpoint_share, int | float) and 0 < self.checkpoint_share <= 1):
             raise ArgumentError(f"checkpoint_share is {self.checkpoint_share!r}; give a share above 0, at most 1")

@@ -17,7 +17,7 @@ _MAX = 2**62
 """Largest number of agents, steps or bytes."""
 
 _Count = Annotated[int, Field(ge=1, le=_MAX)]
-_CountOrNone = Annotated[int, Field(ge=0, le=_MAX)]
+_CountOrZero = Annotated[int, Field(ge=0, le=_MAX)]
 
 
 class OptionsFacts(StrictModel):
@@ -35,8 +35,8 @@ class PlanFacts(StrictModel):
     agents: _Count
     partitions: Annotated[dict[str, PartitionFacts], Field(min_length=1, max_length=10_000)]
     members: dict[str, _Count]
-    steps: dict[str, _CountOrNone]
-    free_bytes: _CountOrNone
+    steps: dict[str, _CountOrZero]
+    free_bytes: _CountOrZero
     workers: int | None = None
     """Of versions whose workers held leases."""
 

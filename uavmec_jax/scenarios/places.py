@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from uavmec_jax.env.checks import POSITION, check_range
+from uavmec_jax.env.checks import POSITION, check_bool, check_range
 from uavmec_jax.env.layout import Layout, Traffic
 from uavmec_jax.errors import ArgumentError
 from uavmec_jax.traffic.evacuation import Evacuation
@@ -28,8 +28,9 @@ def on_place(
     """
     if layout.n_devices != evacuation.n_devices:
         raise ArgumentError(
-            f"layout has {layout.n_devices} devices; {evacuation.name} has {evacuation.n_devices}, give a layout of as many"
+            f"layout has {layout.n_devices} devices; it should have those of {evacuation.name}, {evacuation.n_devices}"
         )
+    check_bool("moving", moving)
     if scale_to_m is not None:
         check_range("scale_to_m", scale_to_m, gt=0, le=POSITION.le)
     traffic = Traffic(

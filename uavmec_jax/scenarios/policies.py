@@ -17,6 +17,7 @@ from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Policy
 from uavmec_jax.errors import PolicyError
+from uavmec_jax.files.archives import MAX_BYTES, MAX_USER_BYTES
 from uavmec_jax.files.locations import StoreError, reached, reason_of
 from uavmec_jax.files.validation import suggest
 from uavmec_jax.planning.fleet_demand import is_alone
@@ -137,7 +138,10 @@ class TrainedPolicy:
             PolicyError: the observation has another shape, or is not an array of finite numbers.
         """
         try:
-            array = np.asarray(observation, np.float32)
+            array = np.asarray(observation)
+            if array.dtype.kind not in "biuf":
+                raise TypeError(f"its dtype is {array.dtype}")
+            array = array.astype(np.float32)
         except (TypeError, ValueError) as error:
             raise PolicyError(f"the observation is not an array of numbers: {error}") from None
         size = 2 * self.n_devices if self.n_devices else len(FEATURES) + 1
@@ -203,8 +207,8 @@ def load_policy(source: str | Path, which: str = "best", **axes: Any) -> Policy:
     shipped = {Path(file.name).stem: file for file in _SHIPPED.iterdir() if file.name.endswith(".npz")}
     location = Path(str(shipped[str(source)])) if str(source) in shipped else source
     with reached(location, PolicyError) as path:
-        path = _weights_file(path, [*shipped, *FLEET_HEURISTICS, "rollout"])
-        collection = read_policies(path)
+        given, path = path, _weights_file(path, [*shipped, *FLEET_HEURISTICS, "rollout"])
+        collection = read_policies(path, max_bytes=MAX_USER_BYTES if path == given else MAX_BYTES)
     kinds = {key.split("/")[1] for key in collection.weights}
     if len(kinds) == 1:
         (which,) = kinds
@@ -236,4 +240,4 @@ def draws_scenarios(directory: Path) -> bool:
     Raises:
         PolicyError: the folder holds no weights, or they are damaged.
     """
-    return bool(read_policies(directory / WEIGHTS).drawn)
+    return bool(read_policies(directory / WEIGHTS, max_bytes=MAX_BYTES).drawn)

@@ -118,14 +118,14 @@ def write_policies(path: Path, collection: PolicyCollection) -> None:
     write_checked(path, SCHEMA, facts, collection.weights)
 
 
-def read_policies(path: Path) -> PolicyCollection:
-    """Read and check a collection.
+def read_policies(path: Path, *, max_bytes: int = MAX_USER_BYTES) -> PolicyCollection:
+    """Read and check a collection that takes at most ``max_bytes`` unpacked.
 
     Raises:
         PolicyError: the file is missing, damaged, altered, no policy file, or from another version, or something in it is
             not what it should be; one line.
     """
-    facts, weights = read_checked(path, SCHEMA, "a file of policies", PolicyError, max_bytes=MAX_USER_BYTES)
+    facts, weights = read_checked(path, SCHEMA, "a file of policies", PolicyError, max_bytes=max_bytes)
     check_header(path, facts)
     if facts.get("features", []) not in ([], [feature.name for feature in FEATURES]):
         raise PolicyError(

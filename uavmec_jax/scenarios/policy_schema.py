@@ -122,7 +122,7 @@ def check_weights(path: Path, weights: Mapping[str, np.ndarray], shapes: Mapping
         if key not in expected or leaf.shape != expected[key]:
             raise PolicyError(f"{path}: its weights do not fit its {name} network of this version")
         if leaf.dtype != np.float32:
-            raise PolicyError(f"{path}: weights {key} are of type {leaf.dtype}; they should be of float32")
+            raise PolicyError(f"{path}: weights {key} are of type {leaf.dtype}; they should be float32")
     for name in shapes:
         kinds = {kind for kind in KINDS for key in weights if key.startswith(f"{name}/{kind}/")}
         if not kinds or any(f"{name}/{kind}/{leaf}" not in weights for kind in kinds for leaf in shapes[name]):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import tomli_w
 
+from uavmec_jax.env.scenario_checks import check_scenario
 from uavmec_jax.errors import ScenarioError
 from uavmec_jax.files.parsing import parse_csv, parse_toml
 from uavmec_jax.files.reading import read_text
@@ -98,7 +99,9 @@ def scenario_text(scenario: NamedScenario, suffix: str = ".toml") -> str:
 
     Raises:
         ScenarioError: a CSV was asked for, and the scenario has more than devices.
+        ArgumentError: a value of the scenario cannot be; one line.
     """
+    check_scenario(scenario.params, scenario.layout)
     file = scenario.file
     devices, depots, uavs = (
         [table.model_dump(exclude_none=True) for table in tables] for tables in (file.device, file.depot, file.uav)

@@ -97,7 +97,7 @@ class Uav(Located):
     flying_power_w: _Power | None = None
     hovering_power_w: _Positive | None = None
     battery_j: _Positive | None = None
-    signal_range_m: _Positive | None = None
+    signal_range_m: Annotated[float, Field(gt=0, le=MAX_LENGTH_M), usual_size] | None = None
 
 
 class ScenarioFile(StrictModel):

@@ -96,7 +96,7 @@ def _begun(path: Path, space: Space) -> bool:
         raise StudyError(f"{facts}: is missing, damaged or not of a search; {_NEW_FOLDER}") from None
     if not same:
         raise StudyError(f"{path}: holds another search; {_NEW_FOLDER}")
-    if database.exists() and not database.is_file():
+    if database.is_symlink() or (database.exists() and not database.is_file()):
         raise StudyError(f"{database}: is not a file; {_NEW_FOLDER}")
     begun = before.get("begun") is True
     if begun and not (database.exists() and database.stat().st_size):
@@ -130,7 +130,7 @@ def _open(optuna: Any, database: Path, space: Space) -> "optuna.Study":
 
     url = URL.create("sqlite", database=str(database)).render_as_string()
     digest = hashlib.sha256(identity(space).encode()).hexdigest()
-    others = StudyError(f"{database}: holds the trials of something else than {space.name}; {_NEW_FOLDER}")
+    others = StudyError(f"{database}: holds the trials of something other than {space.name}; {_NEW_FOLDER}")
     if (tables := _tables(database)) and tables.isdisjoint(_OPTUNAS):
         raise others
     try:
@@ -145,7 +145,7 @@ def _open(optuna: Any, database: Path, space: Space) -> "optuna.Study":
         raise
     except (RuntimeError, LookupError, ValueError, TypeError, AttributeError, AssertionError) as error:
         # Optuna trusts what it finds in a database: other versions of its tables, and values that it would not write
-        raise StudyError(f"{database}: cannot be used: {error or type(error).__name__}") from None
+        raise StudyError(f"{database}: cannot be used: {str(error) or type(error).__name__}") from None
     if SPACE not in trials.user_attrs:
         trials.set_user_attr(SPACE, digest)
     return trials

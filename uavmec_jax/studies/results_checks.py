@@ -64,7 +64,12 @@ def check_agents(study: Study, agents: pd.DataFrame, source: object) -> None:
             _check_axis(study, str(name), column, source)
         elif str(name).endswith(("_cause", "_cause_fixed")):
             causes = {"", *(cause.name.lower() for cause in Cause)}
-            _check_all(column.isin(list(causes)), column, source, "it should be a cause")
+            _check_all(
+                column.isin(list(causes)),
+                column,
+                source,
+                f"it should be empty or one of {', '.join(sorted(causes - {''}))}",
+            )
         elif str(name).endswith("_devices_fixed"):
             _check_all(column.astype(str).str.fullmatch(r"[0-9 ]*"), column, source, "it should be numbers of devices")
         else:
@@ -174,7 +179,7 @@ def check_evaluation(study: Study, agents: int, evaluation: Mapping[str, np.ndar
         good = (array >= least) & (array <= most) & ~np.isinf(array)
         if kind == "f" and planner:
             good |= np.isnan(array)
-        _check_values(name, array, good, source)
+        _check_values(name, array, good, source, f"from {least} to {most}" if np.isfinite(most) else "at least 0")
 
 
 def check_curves(study: Study, agents: Mapping[str, int], curves: Mapping[str, np.ndarray], source: object) -> None:
@@ -196,9 +201,9 @@ def check_curves(study: Study, agents: Mapping[str, int], curves: Mapping[str, n
             steps, values = curves[f"{algorithm}/{x}"], curves[f"{algorithm}/{name}"]
             _check_array(f"{algorithm}/{x}", steps, "i", (len(steps.ravel()),), source)
             _check_array(f"{algorithm}/{name}", values, "f", (count, len(steps)), source)
-            _check_values(f"{algorithm}/{x}", steps, steps >= 0, source)
+            _check_values(f"{algorithm}/{x}", steps, steps >= 0, source, "at least 0")
             good = ~np.isinf(values) if name == "episode_length" else np.isfinite(values)
-            _check_values(f"{algorithm}/{name}", values, good, source)
+            _check_values(f"{algorithm}/{name}", values, good, source, "a finite number")
 
 
 def _check_names(arrays: Iterable[str], expected: Iterable[str], source: object) -> None:
@@ -219,9 +224,11 @@ def _check_array(name: str, array: np.ndarray, kind: str, shape: tuple[int, ...]
         raise StudyError(f"{source}: array {name!r} has the shape {array.shape}; the study gives {shape}")
 
 
-def _check_values(name: str, array: np.ndarray, good: np.ndarray, source: object) -> None:
-    """Check that all values of an array are good."""
+def _check_values(name: str, array: np.ndarray, good: np.ndarray, source: object, right: str) -> None:
+    """Check that all values of an array are good; ``right`` says in messages what they should be."""
     if not good.all():
         place = np.unravel_index(int(np.argmin(good)), array.shape)
         where = ", ".join(str(int(index) + 1) for index in place)
-        raise StudyError(f"{source}: array {name!r} holds {array[place]} at [{where}], counted from 1")
+        raise StudyError(
+            f"{source}: array {name!r} holds {array[place]} at [{where}], counted from 1; it should be {right}"
+        )

@@ -110,7 +110,7 @@ def _read_agents(path: Path, study: Study) -> pd.DataFrame:
     except StudyError:
         raise
     except (ValueError, OverflowError, MemoryError, RecursionError) as error:  # pandas' own errors are ValueErrors
-        raise StudyError(f"{path}: cannot be read: {error or type(error).__name__}") from None
+        raise StudyError(f"{path}: cannot be read: {str(error) or type(error).__name__}") from None
     check_agents(study, agents, path)
     return agents
 
@@ -168,4 +168,4 @@ def load_weights(directory: str | Path, which: str = "best", algorithm: str | No
         PolicyError: there are no such weights, the file is damaged, or its object store cannot be reached.
     """
     with reached(directory, PolicyError) as path:
-        return read_policies(path / WEIGHTS).weights_of(which, algorithm)
+        return read_policies(path / WEIGHTS, max_bytes=MAX_BYTES).weights_of(which, algorithm)

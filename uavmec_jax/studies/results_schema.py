@@ -31,7 +31,7 @@ class PartitionFacts(StrictModel):
     def _check(self) -> "PartitionFacts":
         if self.shard_size % self.groups:
             raise ValueError(
-                f"a partition has shards of {self.shard_size} agents in {self.groups} groups of equal size"
+                f"shard_size is {self.shard_size}; it should be a multiple of groups, which is {self.groups}"
             )
         return self
 
@@ -106,7 +106,7 @@ def check_label(run: dict[str, Any], study: Study, source: object) -> None:
         if run[name] != expected:
             raise StudyError(f"{source}: {name} is {run[name]!r}; the study file beside it has {expected!r}")
     if len(run["seeds"]) != n_seeds(study) or run["seeds"] != seeds_of(study):
-        raise StudyError(f"{source}: seeds are others than those of the study file beside it")
+        raise StudyError(f"{source}: seeds differ from those of the study file beside it")
     places = run.get("places", {})
     if set(places) != set(places_of(study)):
         raise StudyError(

@@ -104,7 +104,7 @@ class ShardResult:
 
         weights = arrays_of("weights")
         if inside := [name for name in weights if any(f"{name}/" == other[: len(name) + 1] for other in weights)]:
-            raise StudyError(f"{path}: array 'weights/{inside[0]}' is an array and a folder of arrays")
+            raise StudyError(f"{path}: array 'weights/{inside[0]}' is both an array and the folder of other arrays")
         return cls(
             algorithm=facts.algorithm,
             rows=_table(path, facts.columns, arrays_of("rows")),
@@ -134,7 +134,7 @@ class ShardResult:
         if any(name not in self.rows or self.rows[name].tolist() != values for name, values in axes.items()):
             raise StudyError(f"{source}: belongs to another shard: its agents are not those of this one")
         if self.steps and not (self.seconds.get("train", 0.0) > 0 and "validate" in self.seconds):
-            raise StudyError(f"{source}: seconds are {self.seconds}; training takes some, and has those of validation")
+            raise StudyError(f"{source}: seconds are {self.seconds}; train should be above 0, and validate be there")
         parts = [name for name in PART_AXES if name in axes and name not in study.axes]
         check_agents(study, self.rows.drop(columns=parts), source)
         check_evaluation(study, len(ids), self.evaluation, source)
@@ -144,8 +144,10 @@ class ShardResult:
         for name, leaf in weights.items():
             if leaf.dtype.kind != "f" or leaf.shape[:1] != (len(ids),):
                 raise StudyError(f"{source}: array 'weights/{name}' should hold the numbers of {len(ids)} agents")
-        if {name.partition("/")[0] for name in weights} != ({"best", "last"} if study.algorithms else set()):
-            raise StudyError(f"{source}: has weights of another kind than the study gives")
+        kinds, given = {name.partition("/")[0] for name in weights}, {"best", "last"} if study.algorithms else set()
+        if kinds != given:
+            found, expected = (", ".join(sorted(names)) or "none" for names in (kinds, given))
+            raise StudyError(f"{source}: has the weights {found}; the study gives {expected}")
 
 
 def _table(path: Path, names: list[str], columns: Mapping[str, np.ndarray]) -> pd.DataFrame:

@@ -189,4 +189,4 @@ class _Elements(CheckingHandler):
 
 def _label(name: str, attrs: Any) -> str:
     """Return how messages name an element."""
-    return f"{name} {attrs['id']!r}" if "id" in attrs else f"a {name}"
+    return f"{name} {attrs['id']!r}" if "id" in attrs else f"an element <{name}>"

@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -109,16 +108,18 @@ def train(
         on_progress: called after every chunk; on Ray, after every shard.
 
     Raises:
-        ArgumentError: a number is out of range: the steps, a hyperparameter, the validation, or a value of a scenario.
+        ArgumentError: a number is out of range: the steps, a hyperparameter, the validation, or a value of a scenario;
+            or the scenarios are not a batch.
         StudyError: an unknown algorithm, hyperparameter or setting, a wrong number of values, too little memory, several
             UAVs or depots, or a DQN on the paper's observation where episodes go on after a failure; on Ray, also if it
             is not installed or cannot be reached, a node has other code, or a shard failed.
-        AssertionError: the scenarios are not a batch.
     """
     if algorithm not in ALGORITHMS:
         raise StudyError(f"algorithm is {algorithm!r}; {suggest(algorithm, ALGORITHMS)}")
     check_range("steps", steps, ge=1, le=MAX_STEPS, whole=True)
-    chex.assert_rank(scenarios.layout.capacity, 2)
+    if np.ndim(scenarios.layout.capacity) != 2:
+        shape = np.shape(scenarios.layout.capacity)
+        raise ArgumentError(f"scenarios.layout.capacity has shape {shape}; it should be (scenarios, devices)")
     check_scenario(scenarios.params, scenarios.layout)
     check_reward(scenarios.reward)
     _check_scenarios(algorithm, scenarios, (settings or {}).get("observation", "paper"))
