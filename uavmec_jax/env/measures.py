@@ -9,7 +9,7 @@ from uavmec_jax.env.depots import stands_at
 from uavmec_jax.env.dynamics import Cause, State, complete_state, in_service, initial_state
 from uavmec_jax.env.fleet import DepotKind
 from uavmec_jax.env.layout import Layout, fleet_of
-from uavmec_jax.env.params import Params
+from uavmec_jax.env.params import Params, check_params
 from uavmec_jax.env.rollout import Trace
 
 _HIGH_SHARE = 0.95
@@ -64,7 +64,11 @@ def measure(
         start: the state before the first of the slots; by default the initial one.
         by_time: whether a device-slot counts as long as its slot lasts, until the horizon if there is one. Slots in which
             every device is served are short: of many such slots, an average over slots says little.
+
+    Raises:
+        ArgumentError: a parameter is out of range; one line.
     """
+    check_params(params)
     happened = trace.played & (trace.outcome.cause != Cause.UAV)
     present = jnp.ones(layout.n_devices, bool) if layout.present is None else layout.present
     counts = jnp.where(happened, seconds_until_horizon(params, trace) if by_time else 1.0, 0.0)[:, None]

@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
 from uavmec_jax.env.dynamics import Cause, Outcome, State, fresh_state, living_devices, transition
 from uavmec_jax.env.layout import Layout, sample_layout
-from uavmec_jax.env.params import Params
+from uavmec_jax.env.params import Params, check_params
 from uavmec_jax.env.rewards import Reward, check_guard, check_reward, make_reward, reward_of, traffic_reward
 from uavmec_jax.env.scenario_checks import check_scenario
 
@@ -55,7 +55,12 @@ def make_scenario(layout: Layout | None = None, params: Params | None = None, re
 
 
 def draw_volumes(params: Params, uniform: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Turn uniform random numbers in [0, 1) into task volumes in bytes."""
+    """Turn uniform random numbers in [0, 1) into task volumes in bytes.
+
+    Raises:
+        ArgumentError: a parameter is out of range; one line.
+    """
+    check_params(params)
     low, high = params.task_volume_range_bytes
     return low + uniform * (high - low)
 

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from uavmec_jax.env.dynamics import State, slots_to_expiry
 from uavmec_jax.env.layout import Layout
-from uavmec_jax.env.params import Params
+from uavmec_jax.env.params import Params, check_params
 from uavmec_jax.env.products import product
 from uavmec_jax.planning import demand
 from uavmec_jax.planning.demand import SlotCosts
@@ -34,7 +34,11 @@ def earliest_deadline(params: Params, layout: Layout, state: State, key: PRNGKey
 
     The services that the batteries need are those for the feasible horizon (:func:`feasible_horizon`). If they need none
     and the ages can spare the slot, the UAV stays where it is.
+
+    Raises:
+        ArgumentError: a parameter is out of range; one line.
     """
+    check_params(params)
     covers = demand.coverage(params, layout)
     mean = demand.mean_slot(params, layout)
     slots, services = feasible_horizon(params, layout, state, mean, demand.visit_shares(layout, covers))

@@ -16,7 +16,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num, PRNGKeyArray
 
 from uavmec_jax.env.dynamics import State, complete_state, initial_state, slots_to_expiry
 from uavmec_jax.env.layout import Layout
-from uavmec_jax.env.params import Params
+from uavmec_jax.env.params import Params, check_params
 from uavmec_jax.env.products import product
 from uavmec_jax.planning import demand, fleet_demand
 from uavmec_jax.planning.deadlines import earliest_deadline as of_one_uav
@@ -52,7 +52,11 @@ def earliest_deadline(params: Params, layout: Layout, state: State, key: PRNGKey
 
     A UAV that nothing needs serves the battery with the least left over, or returns to a depot if its own runs low. With one
     UAV and no depots the rule is :func:`deadlines.earliest_deadline`.
+
+    Raises:
+        ArgumentError: a parameter is out of range; one line.
     """
+    check_params(params)
     state = complete_state(layout, state)
     living, seen = _see_living(params, layout, state)
     if fleet_demand.is_alone(layout):

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from uavmec_jax.env.dynamics import State, slots_to_expiry
 from uavmec_jax.env.fixed_point import order_independent_sum
 from uavmec_jax.env.layout import Layout
-from uavmec_jax.env.params import Params
+from uavmec_jax.env.params import Params, check_params
 from uavmec_jax.planning import deadlines, demand
 from uavmec_jax.planning.demand import SlotCosts
 
@@ -89,7 +89,11 @@ def observe_devices(params: Params, layout: Layout, state: State) -> Observation
         params: scenario parameters.
         layout: ``n`` devices, some of which may be padding.
         state: before the slot.
+
+    Raises:
+        ArgumentError: a parameter is out of range; one line.
     """
+    check_params(params)
     chex.assert_equal_shape([layout.capacity, state.battery, state.age])
     n = layout.capacity.shape[0]
     mask = jnp.ones(n, bool) if layout.present is None else layout.present
