@@ -46,7 +46,7 @@ def of_one_shape(seed):
 @pytest.mark.slow
 @pytest.mark.parametrize("one_shape", [True, pytest.param(False, marks=pytest.mark.full)])
 def test_no_policy_beats_the_optimum_and_a_wide_beam_reaches_it(one_shape):
-    chosen = filter(of_one_shape, range(40)) if one_shape else range(30)
+    chosen = filter(of_one_shape, range(60)) if one_shape else range(30)
     seeds = [seed for seed in chosen if solved_instance(seed) is not None]
     assert len(seeds) >= 10
     shares = {}
