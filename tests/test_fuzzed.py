@@ -46,6 +46,16 @@ def test_names_in_a_database_that_are_not_utf8(space, begun):  # noqa: F811
     assert "trials.db: cannot be used: Could not decode to UTF-8 column" in refusal(space, begun)
 
 
+def test_a_schema_in_a_database_that_is_not_utf8(space, begun):  # noqa: F811
+    """SQLite quotes it in its message, and sqlite3 raised UnicodeDecodeError where it read that."""
+    with closing(sqlite3.connect(begun / DATABASE)) as connection, connection:
+        connection.execute("PRAGMA writable_schema = ON")
+        connection.execute(
+            "UPDATE sqlite_master SET name = CAST(X'C328' AS TEXT), sql = 'CREATE x' WHERE name = 'trials'"
+        )
+    assert "trials.db: cannot be used: its schema is damaged" in refusal(space, begun)
+
+
 def test_a_search_with_a_bad_database_writes_nothing(space, begun):  # noqa: F811
     """The label was written before the database was opened."""
     facts = (begun / FACTS).read_text()

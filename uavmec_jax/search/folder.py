@@ -179,6 +179,8 @@ def _one_line(optuna: Any, database: Path) -> Iterator[None]:
 
     try:
         yield
+    except UnicodeDecodeError:  # SQLite quotes what it finds in a damaged schema
+        raise StudyError(f"{database}: cannot be used: its schema is damaged") from None
     except (optuna.exceptions.StorageInternalError, SQLAlchemyError, sqlite3.Error) as error:
         problem = error.__cause__ if isinstance(error, optuna.exceptions.StorageInternalError) else error
         reason = getattr(problem, "orig", None) or problem or error
