@@ -13,6 +13,7 @@ shows the traceback. Writes `fuzz.json` and `README.md`.
 import argparse
 import json
 import os
+import shlex
 import sys
 import tempfile
 from pathlib import Path
@@ -82,7 +83,9 @@ def main() -> None:
         tasks = shares(arguments.inputs, arguments.calls, corpus_in(work), arguments.kinds)
         report = Campaign(arguments.seed, work, lambda line: print(line, flush=True)).run(tasks)
     machine = {name: value for name, value in host.describe().items() if name != "free_memory_gib"}
-    command = " ".join(["python", os.path.relpath(sys.argv[0]), *sys.argv[1:]])
+    # the folder of this machine that keeps the inputs says nothing to others
+    words = ["FOLDER" if word == str(arguments.work) else word for word in sys.argv[1:]]
+    command = shlex.join(["python", os.path.relpath(sys.argv[0]), *words])
     report = {"command": command, "seed": arguments.seed, **report, **machine}
     if arguments.out and arguments.kinds and (arguments.out / "fuzz.json").exists():
         report = merged(json.loads((arguments.out / "fuzz.json").read_text(encoding="utf-8")), report)
