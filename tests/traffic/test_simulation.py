@@ -227,35 +227,31 @@ def test_sumos_first_error_is_reported(folder, monkeypatch):
 
 
 def test_the_command_from_end_to_end(folder, tmp_path):
-    settings = [f"{table}.{name}={value}" for table, values in SMALL.items() for name, value in values.items()]
-    options = [part for setting in settings for part in ("--set", setting)]
+    def run(*options, **tables):
+        settings = [f"{table}.{name}={value}" for table, values in tables.items() for name, value in values.items()]
+        options = [*options, *(part for setting in settings for part in ("--set", setting))]
+        done = CliRunner().invoke(main, [*command, *options])
+        assert done.exit_code == 0, done.output
+        return done.stdout
+
     out = tmp_path / "streets.npz"
     (tmp_path / "Städtchen (1).osm.gz").write_bytes((folder / "streets.osm.gz").read_bytes())
-    command = [
-        "traffic",
-        "build",
-        "--osm",
-        str(tmp_path / "Städtchen (1).osm.gz"),
-        "--bbox",
-        "9.6,49.9,9.8,50.1",
-        *options,
-    ]
-    done = CliRunner().invoke(main, [*command, "--seeds", "1", "--out", str(out)])
-    assert done.exit_code == 0, done.output
-    assert "vehicles in all (150 evacuated in each)" in done.stdout
+    extract = ["--osm", str(tmp_path / "Städtchen (1).osm.gz"), "--bbox", "9.6,49.9,9.8,50.1"]
+    command = ["traffic", "build", *extract, "--seeds", "1", "--out", str(out)]
+    simulation = {name: value for name, value in SMALL["simulation"].items() if name != "seeds"}
+    stdout = run(demand=SMALL["demand"], simulation=simulation, devices=SMALL["devices"])
+    assert "vehicles in all (150 evacuated in each)" in stdout
     data = json.loads(CliRunner().invoke(main, ["traffic", "show", str(out), "--json"]).stdout)
     assert len(data["devices"]) == 4
-    (tmp_path / "devices.toml").write_text(
-        '[[device]]\nname = "a"\nx_m = 0\ny_m = 0\n[[device]]\nname = "b"\nx_m = 200.0\ny_m = 50.0\n'
-    )
-    done = CliRunner().invoke(
-        main, [*command, "--seeds", "1", "--out", str(out), "--devices", str(tmp_path / "devices.toml")]
-    )
-    assert done.exit_code == 0, done.output
-    assert load_evacuation(out).meta["names"] == ["a", "b"]
-    assert load_evacuation(out).name == "St-dtchen-1"
-    assert load_evacuation(out).region_m() == (200, 50)
     assert data["meta"]["settings"]["network"]["bbox"] == [9.6, 49.9, 9.8, 50.1]
+
+    sites = tmp_path / "devices.toml"
+    sites.write_text('[[device]]\nname = "a"\nx_m = 0\ny_m = 0\n[[device]]\nname = "b"\nx_m = 200.0\ny_m = 50.0\n')
+    run("--devices", str(sites), demand=SMALL["demand"], simulation=simulation, devices={"radius_m": 60.0})
+    evacuation = load_evacuation(out)
+    assert evacuation.meta["names"] == ["a", "b"]
+    assert evacuation.name == "St-dtchen-1"
+    assert evacuation.region_m() == (200, 50)
 
 
 def test_nothing_is_left_behind_when_the_command_is_killed(tmp_path):
@@ -278,7 +274,7 @@ def test_nothing_is_left_behind_when_the_command_is_killed(tmp_path):
     assert not (tmp_path / "a.npz").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.skipif(REAL_EXTRACT is None, reason="there is no real extract beside the clone")
 def test_a_real_extract(tmp_path):
     out = tmp_path / "bad_hersfeld.npz"
