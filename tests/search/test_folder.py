@@ -144,6 +144,8 @@ another_name = after("UPDATE studies SET study_name = 'other'")
 another_space = after("UPDATE study_user_attributes SET value_json = '\"x\"'")
 without_batches = after("UPDATE trials SET state = 'COMPLETE'", "DELETE FROM trial_user_attributes")
 another_optuna = after("UPDATE alembic_version SET version_num = 'v99'")
+outside_a_range = after("UPDATE trial_params SET param_value = -7e-177 WHERE param_name = 'learning_rate'")
+other_choices = after("UPDATE trial_params SET distribution_json = replace(distribution_json, '[8]', '[9]')")
 nonsense_inside = after("UPDATE trials SET state = 'WON'")
 other_columns = after("ALTER TABLE studies RENAME COLUMN study_name TO title")
 
@@ -167,6 +169,8 @@ OTHERS = "trials.db: holds the trials of something other than space; give anothe
         (another_name, OTHERS),
         (another_space, OTHERS),
         (without_batches, OTHERS),
+        (outside_a_range, OTHERS),
+        (other_choices, OTHERS),
         (another_optuna, "trials.db: cannot be used: "),
         (nonsense_inside, "trials.db: cannot be used: "),
         (other_columns, "trials.db: cannot be used: "),

@@ -15,7 +15,7 @@ from uavmec_jax.files.locks import lock_folder
 from uavmec_jax.files.output_folders import WORK, check_empty, remove_if_empty
 from uavmec_jax.files.reading import read_json_or_empty
 from uavmec_jax.files.writing import write_text
-from uavmec_jax.search.space import Space, identity
+from uavmec_jax.search.space import Choices, Range, Space, contains, identity
 from uavmec_jax.training import host
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ def import_optuna() -> Any:
         StudyError: it is not installed.
     """
     optuna = optional("optuna", "search", "search")
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    optuna.logging.set_verbosity(optuna.logging.ERROR)  # of what it finds in a damaged database, our error is enough
     return optuna
 
 
@@ -165,7 +165,20 @@ def _is_ours(trial: "optuna.trial.FrozenTrial", space: Space) -> bool:
     """Return whether a trial has what we store; one that no batch has taken yet has nothing, and is not finished."""
     if BATCH not in trial.user_attrs:
         return not trial.state.is_finished()
-    return isinstance(trial.user_attrs[BATCH], int) and set(trial.params) == set(space.space)
+    batched = isinstance(trial.user_attrs[BATCH], int) and set(trial.params) == set(space.space)
+    return batched and all(_searched(values, trial.params[key]) for key, values in space.space.items())
+
+
+def _searched(values: Range | Choices, stored: Any) -> bool:
+    """Return whether a stored value is one of those that are searched."""
+    if isinstance(values, Choices):
+        return stored in [to_optuna(value) for value in values.choices]
+    return isinstance(stored, int | float) and contains(values, stored)
+
+
+def to_optuna(value: Any) -> Any:
+    """Convert a setting for Optuna, which stores lists as text."""
+    return json.dumps(value) if isinstance(value, list) else value
 
 
 @contextmanager

@@ -13,7 +13,7 @@ import pandas as pd
 from uavmec_jax.cluster.connection import connected
 from uavmec_jax.cluster.options import RayOptions
 from uavmec_jax.files.writing import write_text
-from uavmec_jax.search.folder import BATCH, BEST, TRIALS, import_optuna, opened_trials, search_folder
+from uavmec_jax.search.folder import BATCH, BEST, TRIALS, import_optuna, opened_trials, search_folder, to_optuna
 from uavmec_jax.search.halving import SuccessiveHalving, TrialOutcome
 from uavmec_jax.search.space import (
     Choices,
@@ -165,7 +165,7 @@ def _enqueue_baseline(trials: "optuna.Study", space: Space) -> None:
     if not trials.get_trials(deepcopy=False):
         baseline = baseline_settings(space)
         inside = {key: value for key, value in baseline.items() if contains(space.space[key], value)}
-        trials.enqueue_trial({key: _to_optuna(value) for key, value in inside.items()})
+        trials.enqueue_trial({key: to_optuna(value) for key, value in inside.items()})
 
 
 def _propose_batch(optuna: Any, trials: "optuna.Study", space: Space, batch: int) -> list[Any]:
@@ -187,7 +187,7 @@ def _propose_batch(optuna: Any, trials: "optuna.Study", space: Space, batch: int
         if members:
             fixed = {key: members[0].params[key] for key in names}
         elif batch < len(combinations):
-            fixed = {key: _to_optuna(value) for key, value in combinations[batch].items()}
+            fixed = {key: to_optuna(value) for key, value in combinations[batch].items()}
         if fixed:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
@@ -204,16 +204,11 @@ def _propose_batch(optuna: Any, trials: "optuna.Study", space: Space, batch: int
 def _suggest(trial: Any, key: str, values: Range | Choices, baseline: Any) -> None:
     """Let Optuna choose a setting of a trial, as a whole number if the study's own value is one."""
     if isinstance(values, Choices):
-        trial.suggest_categorical(key, [_to_optuna(value) for value in values.choices])
+        trial.suggest_categorical(key, [to_optuna(value) for value in values.choices])
     elif isinstance(baseline, int) and not isinstance(baseline, bool):
         trial.suggest_int(key, int(values.low), int(values.high), log=values.log)
     else:
         trial.suggest_float(key, float(values.low), float(values.high), log=values.log)
-
-
-def _to_optuna(value: Any) -> Any:
-    """Convert a setting for Optuna, which stores lists as text."""
-    return json.dumps(value) if isinstance(value, list) else value
 
 
 def _settings(space: Space, params: Mapping[str, Any]) -> dict[str, Any]:
@@ -250,7 +245,7 @@ def _search_result(optuna: Any, trials: "optuna.Study", space: Space) -> SearchR
         if trial.state.is_finished():
             row = {"number": trial.number, "batch": trial.user_attrs[BATCH], "state": trial.state.name.lower()}
             row |= {"value": trial.value, "steps": max(trial.intermediate_values, default=0)}
-            rows.append(row | {key: _to_optuna(value) for key, value in _settings(space, trial.params).items()})
+            rows.append(row | {key: to_optuna(value) for key, value in _settings(space, trial.params).items()})
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
