@@ -82,6 +82,8 @@ def test_sides_that_cannot_be_compared_are_refused():
         (Side(a, where={"colour": 1}), "has no axis 'colour'; it has seed, powered, connected"),
         (Side(a, where={"powered": 12}), "no agent is left"),
         (Side(a, where={"seed": []}), r"seed is \[\]; give one value of this axis"),
+        (Side(a, where={"seed": [1, [2]]}), r"seed is \[1, \[2\]\]; give one value of this axis"),
+        (Side(a, where={"seed": {"a": 1}}), r"seed is \{'a': 1\}; give one value of this axis"),
     ):
         with pytest.raises(StudyError, match=message):
             pair(a=side, b=Side(a))

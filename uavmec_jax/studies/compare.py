@@ -63,7 +63,7 @@ class Side:
         for axis, value in self.where.items():
             if axis not in axes:
                 raise StudyError(f"{self.results.study.name}: has no axis {axis!r}; it has {', '.join(axes)}")
-            if np.ndim(value):
+            if not pd.api.types.is_scalar(value):
                 raise StudyError(f"{self.results.study.name}: {axis} is {value!r}; give one value of this axis")
             agents = agents[agents[axis] == value]
         if agents.empty:
