@@ -129,6 +129,13 @@ def bad_distribution():
         lambda: um.transition(PARAMS, LAYOUT, STATE, [[1], [2, 3]], VOLUMES),
         lambda: on_place(LAYOUT, um.traffic.load_evacuation("albany"), moving=float("nan")),
         lambda: scenario_text(replace(NAMED, params=PARAMS.replace(region_m=(800.0, -math.inf)))),
+        lambda: um.make_reward({"U": 1e300}),
+        lambda: um.make_reward({"U": [1.0, 2.0]}),
+        lambda: um.make_reward({"S": "1"}),
+        lambda: pad_layout(LAYOUT, 11),
+        lambda: um.planning.beam_search(PARAMS, LAYOUT, jnp.ones((33, 12)), width=2**31),
+        lambda: um.planning.upper_bound(PARAMS.replace(uav_battery_j=2**31), LAYOUT, jnp.ones((33, 12)), 1),
+        lambda: um.initial_state(PARAMS.replace(uav_battery_j=np.int64(2**31)), LAYOUT),
     ],
 )
 def test_values_of_another_kind(call):

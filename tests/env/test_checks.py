@@ -234,6 +234,8 @@ def test_a_reward_that_is_not_finite_is_refused():
         ("3", {"lt": 4}, "x is '3'; it should be a finite number less than 4"),
         (None, {"whole": True}, "x is None; it should be a whole number"),
         (np.array([1e39]), {}, r"x of entry 1 is 1e\+39; it should be a finite number"),
+        (2**31, {"ge": 0}, "x is 2147483648; it should be a finite number of at least 0, and a float"),
+        (np.array([1, 3 * 10**9]), {}, "x of entry 2 is 3000000000; it should be a finite number, and a float"),
     ],
 )
 def test_a_number_out_of_range_is_named(value, bounds, line):
@@ -245,6 +247,8 @@ def test_numbers_in_range_pass():
     check_range("x", np.zeros((0, 2)), gt=0)
     check_range("x", [1, 2.5], ge=1, lt=3)
     check_range("x", float("inf"), gt=0, infinite=True)
+    check_range("x", [2**31 - 1, -(2**31)])
+    check_range("x", 2**31, whole=True)
     assert not Bounds(gt=0, infinite=True).admits(float("nan"))
     check_bool("x", [True, False])
 

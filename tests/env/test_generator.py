@@ -91,7 +91,7 @@ def test_padding_does_not_change_lifetimes(name):
 
 
 def test_more_devices_than_entries_are_refused():
-    with pytest.raises(ValueError, match="has 12 devices; they do not fit into 8"):
+    with pytest.raises(ValueError, match="size is 8; the layout has 12 devices: give 12 or more"):
         pad_layout(sample_layout(jax.random.key(0), Params(), 4, 4), 8)
 
 

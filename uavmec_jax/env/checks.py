@@ -29,6 +29,9 @@ MAX_LENGTH_M = 1e7
 """Largest coordinate, side of a region, altitude and signal range: beyond it, squares of distances lose their metres in
 float32. Northings of networks in UTM come up to it."""
 
+_WHOLE = 2**31
+"""JAX's integers have 32 bits: where NumPy's are larger, it would drop the upper bits without a word."""
+
 _TINY = float(np.finfo(np.float32).tiny)  # in single precision, what is closer to 0 counts as 0,
 _HUGE = float(np.finfo(np.float32).max)  # and what is further from 0 as infinite
 
@@ -85,6 +88,8 @@ class Bounds:
 
     def admits(self, value: float) -> bool:
         """Return whether a number is in the range; one too small for single precision counts as 0."""
+        if isinstance(value, int) and not self.whole and not -_WHOLE <= value < _WHOLE:
+            return False
         value = 0 if -_TINY < value < _TINY else value
         return (
             (self.ge is None or value >= self.ge)
@@ -266,7 +271,8 @@ def _check_known(check: Check) -> None:
         return  # a NaN would be the smallest and the largest
     for index in np.ndindex(array.shape):
         if not bounds.admits(number := array[index].item()):
-            raise ArgumentError(f"{name}{_place(index, axes)} is {_shown(number)}; it should be {bounds}")
+            a_float = ", and a float" if bounds.admits(float(number)) else ""
+            raise ArgumentError(f"{name}{_place(index, axes)} is {_shown(number)}; it should be {bounds}{a_float}")
 
 
 def _place(index: tuple[int, ...], axes: tuple[str, ...]) -> str:

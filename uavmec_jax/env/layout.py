@@ -14,6 +14,7 @@ from uavmec_jax.env.checks import CAPACITY, LARGEST, POSITION, Bounds, Check, ch
 from uavmec_jax.env.fleet import UAV_FIELDS, Depots, Fleet, default_start
 from uavmec_jax.env.params import MAX_DEVICES, Params, check_params
 from uavmec_jax.env.types import Scalar
+from uavmec_jax.errors import ArgumentError
 
 
 @struct.dataclass
@@ -260,13 +261,13 @@ def pad_layout(layout: Layout, size: int) -> Layout:
         size: number of entries of the result, at least ``n``.
 
     Raises:
-        ValueError: there are more than ``size`` devices.
+        ArgumentError: there are more than ``size`` devices.
     """
     chex.assert_rank(layout.capacity, 1)
     check_range("size", size, ge=1, le=MAX_DEVICES, whole=True)
     n = layout.capacity.shape[0]
     if n > size:
-        raise ValueError(f"the layout has {n} devices; they do not fit into {size}")
+        raise ArgumentError(f"size is {size}; the layout has {n} devices: give {n} or more")
 
     def pad(leaf: Array) -> Array:
         return jnp.pad(jnp.asarray(leaf), ((0, size - n),) + ((0, 0),) * (jnp.ndim(leaf) - 1))

@@ -10,12 +10,13 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
-from uavmec_jax.env.checks import Bounds, Check, check_ranges
+from uavmec_jax.env.checks import Bounds, Check, check_range, check_ranges
 from uavmec_jax.env.dynamics import Outcome, State, complete_state, living_devices, service
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.products import product
 from uavmec_jax.env.types import Scalar
+from uavmec_jax.errors import ArgumentError
 
 TERMS: tuple[str, ...] = ("A", "U", "M", "O", "log A", "log U", "log M", "log O")
 """The terms of a reward, in the order of a weight vector.
@@ -50,9 +51,11 @@ def make_weights(terms: Mapping[str, float]) -> np.ndarray:
 
 
 def _finite(term: str, weight: float) -> float:
-    """Return the weight of a term, which has to be finite."""
-    if not np.isfinite(weight):
-        raise ValueError(f"weight of reward term {term!r} is {weight}; it must be a finite number")
+    """Return the weight of a term, which has to be a number that is finite in single precision."""
+    name = f"weight of reward term {term!r}"
+    check_range(name, weight)
+    if np.ndim(weight):
+        raise ArgumentError(f"{name} is {weight!r}; it should be a finite number")
     return weight
 
 

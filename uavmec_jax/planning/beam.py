@@ -35,6 +35,9 @@ from uavmec_jax.planning.beam_score import Problem, ValueFn, dominated, make_pro
 from uavmec_jax.planning.fleet_deadlines import earliest_deadline
 from uavmec_jax.planning.fleet_demand import counting_bound
 
+_MOST_STATES = 1_000_000
+"""Largest width."""
+
 WIDTH = 64
 """States kept per slot by default. A beam four times as wide lengthens one lifetime in 400, by one slot."""
 
@@ -96,7 +99,7 @@ def beam_search(
     """
     check_scenario(params, layout)
     check_volumes(volumes, layout.n_devices)
-    check_range("width", width, ge=1, whole=True)
+    check_range("width", width, ge=1, le=_MOST_STATES, whole=True)
     chex.assert_shape(volumes, (None, layout.capacity.shape[0]))
     if params.end != "first_failure":
         raise ValueError(f"end is {params.end!r}; the beam searches for the longest time to the 'first_failure'")
