@@ -74,7 +74,8 @@ XML = {
 <node id="1" lat="50.1" lon="9.1"/><node id="2" lat="50.2" lon="9.2"><tag k="highway" v="stop"/></node>
 <way id="7"><nd ref="1"/><nd ref="2"/><tag k="highway" v="residential"/><tag k="name" v="Elm"/></way>
 <relation id="9"><member type="way" ref="7" role=""/></relation></osm>""",
-    "net": """<net version="1.20"><location netOffset="0.00,0.00" convBoundary="0.00,0.00,100.00,0.00"/>
+    "net": """<net version="1.20"><location netOffset="0.00,0.00" convBoundary="0.00,0.00,100.00,0.00"
+ origBoundary="0.00,0.00,100.00,0.00" projParameter="!"/>
 <type id="highway.residential" priority="3" numLanes="1" speed="13.89"/>
 <edge id="e" from="a" to="b" priority="3" type="highway.residential"><lane id="e_0" index="0" speed="13.90" length="100.00"
  shape="0.00,0.00 100.00,0.00"/></edge>

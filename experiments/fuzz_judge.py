@@ -29,8 +29,8 @@ HANG_S = 10.0
 MEMORY_BYTES = 300e6
 """Most bytes by which an input may raise the largest memory of the process."""
 
-INFINITE = frozenset({"uplink_rate_bit_s", "window_s", "pads", "packs"})
-"""Fields whose infinity is documented: there is no limit."""
+INFINITE = frozenset({"uplink_rate_bit_s", "window_s", "pads", "packs", "processing_rate"})
+"""Fields whose infinity is documented: there is no limit, or padding has nothing to do."""
 
 UNKNOWN = frozenset({"failure_slot", "returns_in", "returns_in_s", "low", "high"})
 """Fields whose NaN is documented: there is no such number."""

@@ -17,8 +17,9 @@ from tests.scenarios.test_state_files import CAPACITY, state_of
 from tests.search.test_folder import begun, refusal  # noqa: F401  (a fixture)
 from tests.search.test_search import space  # noqa: F401  (a fixture)
 from uavmec_jax.cluster.options import RayOptions
+from uavmec_jax.env import hardware
 from uavmec_jax.env.generator import ScenarioDistribution, sample_scenario
-from uavmec_jax.env.layout import pad_layout
+from uavmec_jax.env.padding import pad_layout
 from uavmec_jax.errors import ArgumentError, PolicyError, StateError, StudyError
 from uavmec_jax.files.archives import read_checked, write_checked
 from uavmec_jax.planning.plan import make_plan
@@ -30,12 +31,14 @@ from uavmec_jax.scenarios.places import on_place
 from uavmec_jax.scenarios.scenario_files import scenario_text
 from uavmec_jax.scenarios.seeds import held_out_draws, layout_for_seed
 from uavmec_jax.search.folder import DATABASE, FACTS
+from uavmec_jax.studies.policy_evaluation import evaluate_policy
 from uavmec_jax.training.chunks import Validation
 
 PARAMS = um.Params()
 LAYOUT = um.sample_layout(jax.random.key(0), PARAMS, 8, 8)
 STATE = um.initial_state(PARAMS, LAYOUT)
 VOLUMES = jnp.full(12, 3e6)
+DISTRIBUTION = ScenarioDistribution(PARAMS.replace(n_devices=16), um.make_reward())
 NAMED = name_scenario(LAYOUT, PARAMS, "x")
 
 
@@ -136,6 +139,15 @@ def bad_distribution():
         lambda: um.planning.beam_search(PARAMS, LAYOUT, jnp.ones((33, 12)), width=2**31),
         lambda: um.planning.upper_bound(PARAMS.replace(uav_battery_j=2**31), LAYOUT, jnp.ones((33, 12)), 1),
         lambda: um.initial_state(PARAMS.replace(uav_battery_j=np.int64(2**31)), LAYOUT),
+        lambda: um.initial_state(PARAMS.replace(count_unfinished_slot=1e300), LAYOUT),
+        lambda: pad_layout(LAYOUT.replace(task=np.full(12, 1e300)), 13),
+        lambda: sample_scenario(replace(DISTRIBUTION, uav_factor=(1e-320, 1.0)), jax.random.key(0)),
+        lambda: sample_scenario(replace(DISTRIBUTION, devices=(4, 0)), jax.random.key(0)),
+        lambda: name_scenario(LAYOUT.replace(task=jnp.full(12, 99)), PARAMS, "x"),
+        lambda: name_scenario(LAYOUT.replace(device_type=jnp.zeros(12)), PARAMS, "x"),
+        lambda: name_scenario(LAYOUT, PARAMS, "x", ["a", "b"]),
+        lambda: um.planning.observe_devices(PARAMS, LAYOUT, STATE.replace(uav_energy=jnp.ones(1, complex))),
+        lambda: evaluate_policy(um.planning.HEURISTICS["oldest-first"], 1j, NAMED, jax.random.key(0)[None]),
     ],
 )
 def test_values_of_another_kind(call):
@@ -143,6 +155,34 @@ def test_values_of_another_kind(call):
     with pytest.raises(ArgumentError) as refused:
         call()
     assert "\n" not in str(refused.value)
+
+
+def test_a_path_that_is_too_long():
+    """Looking for it raised OSError."""
+    with pytest.raises(StudyError, match=r"^A{60}\.\.\.: File name too long; give a shorter path$"):
+        um.load_results("A" * 300)
+
+
+def test_a_scenario_that_is_named_keeps_its_hardware():
+    """Those of a distribution had the powers and rates of the tables, and unlisted devices those of the last row."""
+    drawn = sample_scenario(replace(DISTRIBUTION, typical=0.0), jax.random.key(1))
+    named = name_scenario(drawn.layout, drawn.params, "x")
+    assert 4 <= named.layout.n_devices == drawn.layout.present.sum() < 16
+    unlisted = name_scenario(LAYOUT.replace(device_type=jnp.full(12, hardware.UNLISTED)), PARAMS, "x")
+    for field in ("standby_power", "active_power", "processing_rate"):
+        present = getattr(drawn.layout, field)[: named.layout.n_devices]
+        assert np.array_equal(getattr(named.layout, field), present)
+        assert np.array_equal(getattr(unlisted.layout, field), getattr(LAYOUT, field))
+
+
+@pytest.mark.usefixtures("without_type_checks")
+def test_volumes_of_numpy_are_searched():
+    """A traced slot is no index of NumPy's."""
+    volumes = um.env.volume_table(PARAMS, 12, jax.random.key(0), 33)
+    of_jax, of_numpy = (
+        um.planning.beam_search(PARAMS, LAYOUT, array, width=2).lifetime for array in (volumes, np.asarray(volumes))
+    )
+    assert of_jax == of_numpy
 
 
 def test_a_layout_of_numpy_arrays_is_played():

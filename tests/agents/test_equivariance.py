@@ -14,7 +14,7 @@ from tests.small_scenarios import mid_life
 from uavmec_jax.agents import dqn, ppo, pqn
 from uavmec_jax.agents.equivariant_networks import ABSENT_LOGIT, sum_over_devices
 from uavmec_jax.agents.observation_spec import OBSERVATIONS
-from uavmec_jax.env.layout import pad_layout
+from uavmec_jax.env.padding import pad_layout
 from uavmec_jax.planning.observation import FEATURES, observe_devices
 
 SPEC = ppo.PPOSpec(hidden=(16, 24), observation="full", n_envs=4, n_steps=8, batch_size=16)

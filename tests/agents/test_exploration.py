@@ -11,7 +11,7 @@ from scipy import stats
 
 from tests.small_scenarios import mid_life
 from uavmec_jax.agents.exploration import GUIDES, NO_GUIDE, exploratory_action, spread_epsilons
-from uavmec_jax.env.layout import pad_layout
+from uavmec_jax.env.padding import pad_layout
 from uavmec_jax.env.rewards import make_reward
 from uavmec_jax.env.scenario import Scenario
 from uavmec_jax.planning.heuristics import HEURISTICS

@@ -15,7 +15,7 @@ from uavmec_jax.agents.algorithm import Agent
 from uavmec_jax.agents.dqn import DQNHyper, DQNSpec
 from uavmec_jax.env.dynamics import initial_state
 from uavmec_jax.env.generator import ScenarioDistribution
-from uavmec_jax.env.layout import pad_layout
+from uavmec_jax.env.padding import pad_layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rewards import make_reward
 from uavmec_jax.env.rollout import priced_lifetimes

@@ -13,7 +13,8 @@ from tests.env.fleet_reference import CHARGE, SWAP, reference_reward_terms, refe
 from uavmec_jax.env import hardware
 from uavmec_jax.env.dynamics import Cause, State, transition
 from uavmec_jax.env.fleet import Depots, Fleet
-from uavmec_jax.env.layout import Layout, mask_absent
+from uavmec_jax.env.layout import Layout
+from uavmec_jax.env.padding import mask_absent
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rewards import make_reward, reward_of
 

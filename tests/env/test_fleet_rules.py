@@ -25,7 +25,7 @@ from tests.env.small_fleets import (
 from tests.small_scenarios import three_devices
 from uavmec_jax.env.dynamics import Cause, initial_state
 from uavmec_jax.env.fleet import make_depots
-from uavmec_jax.env.layout import mask_absent
+from uavmec_jax.env.padding import mask_absent
 from uavmec_jax.env.params import Params
 
 

@@ -8,7 +8,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from uavmec_jax.env import hardware
 from uavmec_jax.env.generator import ScenarioDistribution, sample_scenario, scenario_from_draw
-from uavmec_jax.env.layout import pad_layout, sample_layout
+from uavmec_jax.env.layout import sample_layout
+from uavmec_jax.env.padding import pad_layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rewards import make_reward
 from uavmec_jax.env.rollout import returns, rollout, rollout_draws, rollouts

@@ -8,8 +8,10 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from uavmec_jax.env import hardware
-from uavmec_jax.env.layout import make_layout, pad_layout, sample_layout
+from uavmec_jax.env.layout import make_layout, sample_layout
+from uavmec_jax.env.padding import pad_layout
 from uavmec_jax.env.params import Params
+from uavmec_jax.errors import ArgumentError
 
 
 def test_tables_spot_checks():
@@ -69,7 +71,7 @@ def test_shapes_that_do_not_fit_together_are_refused():
     layout = sample_layout(jax.random.key(0), Params(), 4, 8)
     fields = layout.position, layout.device_type, layout.task, layout.capacity, layout.has_power, layout.has_comms
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), layout)
-    with pytest.raises(AssertionError, match="rank"):
+    with pytest.raises(ArgumentError, match=r"capacities of shape \(2, 12\); give one layout, not a batch"):
         pad_layout(batch, 16)
     with pytest.raises(AssertionError, match="rank"):
         sample_layout(jax.random.key(0), Params(), jnp.array([4, 5]), 8)

@@ -7,7 +7,8 @@ import numpy as np
 from tests.planning.instances import traced
 from uavmec_jax.env.dynamics import initial_state
 from uavmec_jax.env.fleet import make_depots, make_fleet
-from uavmec_jax.env.layout import pad_layout, sample_layout
+from uavmec_jax.env.layout import sample_layout
+from uavmec_jax.env.padding import pad_layout
 from uavmec_jax.env.params import Params
 
 

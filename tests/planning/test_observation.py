@@ -10,8 +10,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from tests.small_scenarios import mid_life, three_devices
 from uavmec_jax.env.dynamics import initial_state
-from uavmec_jax.env.layout import Traffic, pad_layout
+from uavmec_jax.env.layout import Traffic
+from uavmec_jax.env.padding import pad_layout
 from uavmec_jax.env.params import Params
+from uavmec_jax.errors import ArgumentError
 from uavmec_jax.planning import deadlines, demand
 from uavmec_jax.planning.observation import FEATURES, observe_devices
 
@@ -102,7 +104,7 @@ def test_features_of_padding_are_zero():
 def test_a_state_of_another_number_of_devices_is_refused(small):
     params, layout, state = small
     of_four = {"battery": jnp.ones(4), "age": jnp.zeros(4, jnp.int32), "failed_at": jnp.full(4, -1)}
-    with pytest.raises(AssertionError, match="shape"):
+    with pytest.raises(ArgumentError, match=r"state\.battery has shape \(4,\); it should be \(3,\), one per device"):
         observe_devices(params, layout, state.replace(**of_four))
 
 

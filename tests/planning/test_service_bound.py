@@ -7,7 +7,8 @@ from numpy.testing import assert_allclose
 
 from tests.small_scenarios import three_devices
 from uavmec_jax.env.fleet import make_depots, make_fleet
-from uavmec_jax.env.layout import pad_layout, sample_layout
+from uavmec_jax.env.layout import sample_layout
+from uavmec_jax.env.padding import pad_layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import rollouts
 from uavmec_jax.planning.heuristics import FLEET_HEURISTICS

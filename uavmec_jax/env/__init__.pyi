@@ -15,11 +15,11 @@ from .hardware import TASKS as TASKS
 from .layout import Layout as Layout
 from .layout import Traffic as Traffic
 from .layout import make_layout as make_layout
-from .layout import pad_layout as pad_layout
 from .layout import sample_layout as sample_layout
 from .measures import ServiceMeasures as ServiceMeasures
 from .measures import measure as measure
 from .observation import observe as observe
+from .padding import pad_layout as pad_layout
 from .params import MAX_DEVICES as MAX_DEVICES
 from .params import Params as Params
 from .rewards import DEFAULT_REWARD as DEFAULT_REWARD

@@ -66,13 +66,15 @@ class Bounds:
 
     @classmethod
     def of(cls, field: dataclasses.Field, largest: float | None = None) -> "Bounds":
-        """Return the bounds of a field of a dataclass: those in its metadata; if there are none, at least 0.
+        """Return the bounds of a field of a dataclass: those in its metadata; if there are none, 0 or 1 or at least 0.
 
         Args:
             field: its default is a number, infinite if infinity is allowed.
             largest: upper limit where the metadata have none.
         """
         given = {name: field.metadata[name] for name in ("ge", "gt", "le", "lt") if name in field.metadata}
+        if isinstance(field.default, bool):
+            given = {"ge": 0, "le": 1}
         infinite = isinstance(field.default, float) and math.isinf(field.default)
         return cls(**({"le": None if infinite else largest} | (given or {"ge": 0})), infinite=infinite)
 
@@ -148,6 +150,20 @@ def check_shape(name: str, value: Any, shape: tuple[int, ...], what: str) -> Non
     found = tuple(np.shape(value))
     if found[len(found) - len(shape) :] != shape or len(found) < len(shape):
         raise ArgumentError(f"{name} has shape {found}; it should be {shape}, {what}")
+
+
+def check_rising(name: str, value: Any) -> None:
+    """Check that a range is two numbers, ``(low, high)``, of which the second is not the smaller one, if they are known.
+
+    Raises:
+        ArgumentError: one line.
+    """
+    numbers = len(value) if isinstance(value, tuple | list) else (*np.shape(value), 0)[0]
+    if numbers != 2:
+        raise ArgumentError(f"{name} is {value!r}; it should be (low, high)")
+    low, high = value
+    if not is_traced((low, high)) and np.any(np.asarray(low) > np.asarray(high)):
+        raise ArgumentError(f"{name} is ({low}, {high}); it should be (low, high) with low <= high")
 
 
 def check_bool(name: str, value: Any) -> None:

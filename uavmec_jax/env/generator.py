@@ -1,6 +1,5 @@
 """Distributions of scenarios: each draw has other devices, hardware and traffic."""
 
-import dataclasses
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -10,8 +9,9 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, Num, PRNGKeyArray
 
 from uavmec_jax.env import hardware
-from uavmec_jax.env.checks import LARGEST, Bounds, Check, check_ranges
-from uavmec_jax.env.layout import Layout, Traffic, make_layout, mask_absent
+from uavmec_jax.env.checks import LARGEST, MAX_LENGTH_M, Bounds, Check, check_ranges, check_rising
+from uavmec_jax.env.layout import Layout, Traffic, make_layout
+from uavmec_jax.env.padding import mask_absent
 from uavmec_jax.env.params import MAX_DEVICES, Params, check_params
 from uavmec_jax.env.rewards import Reward
 from uavmec_jax.env.scenario import Scenario
@@ -65,11 +65,24 @@ class ScenarioDistribution:
     traffic_weights: tuple[float, ...] | Float[Array, "*batch m"] = (0.0,)
 
 
-_AT_LEAST = Bounds(ge=0, le=LARGEST)
+_FACTOR = Bounds(ge=1e-6, le=1e6)
 _BOUNDS = {
     **{name: Bounds(ge=0, le=1) for name in ("typical", "powered", "connected", "traffic", "traffic_weights")},
     **{name: Bounds(ge=0, le=MAX_DEVICES) for name in ("typical_devices", "typical_least", "devices")},
+    **dict.fromkeys(("battery_factor", "hardware_factor", "uav_factor"), _FACTOR),
+    "region_m": Bounds(ge=1e-6, le=MAX_LENGTH_M),
+    "traffic_price": Bounds(ge=0, le=LARGEST),
 }
+_RISING = (
+    "devices",
+    "powered",
+    "connected",
+    "region_m",
+    "battery_factor",
+    "hardware_factor",
+    "uav_factor",
+    "traffic_price",
+)
 
 
 def check_distribution(distribution: ScenarioDistribution, name: str = "distribution") -> None:
@@ -81,12 +94,13 @@ def check_distribution(distribution: ScenarioDistribution, name: str = "distribu
     check_params(distribution.params, f"{name}.params")
     check_ranges(
         [
-            Check(f"{name}.{field.name}", leaf, _BOUNDS.get(field.name, _AT_LEAST), ("value",))
-            for field in dataclasses.fields(distribution)
-            if field.name not in ("params", "reward")
-            for leaf in jax.tree.leaves(getattr(distribution, field.name))  # one end of a range may be traced
+            Check(f"{name}.{field}", leaf, bounds, ("value",))
+            for field, bounds in _BOUNDS.items()
+            for leaf in jax.tree.leaves(getattr(distribution, field))  # one end of a range may be traced
         ]
     )
+    for field in _RISING:
+        check_rising(f"{name}.{field}", getattr(distribution, field))
 
 
 def sample_scenario(distribution: ScenarioDistribution, key: PRNGKeyArray) -> Scenario:

@@ -1,7 +1,6 @@
 """Layouts: the devices of a scenario, random or given."""
 
 import math
-from dataclasses import replace
 
 import chex
 import jax
@@ -10,11 +9,10 @@ from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num, PRNGKeyArray
 
 from uavmec_jax.env import hardware
-from uavmec_jax.env.checks import CAPACITY, LARGEST, POSITION, Bounds, Check, check_bool, check_range, check_ranges
+from uavmec_jax.env.checks import CAPACITY, LARGEST, POSITION, Bounds, Check, check_bool, check_ranges
 from uavmec_jax.env.fleet import UAV_FIELDS, Depots, Fleet, default_start
-from uavmec_jax.env.params import MAX_DEVICES, Params, check_params
+from uavmec_jax.env.params import Params, check_params
 from uavmec_jax.env.types import Scalar
-from uavmec_jax.errors import ArgumentError
 
 
 @struct.dataclass
@@ -225,56 +223,3 @@ def sample_layout(
         has_power=jax.random.permutation(k_power, n) < n_powered,
         has_comms=jax.random.permutation(k_comms, n) < n_connected,
     )
-
-
-_FAR_AWAY_M = 1e6
-"""Coordinates of padding: out of range of all devices, and further than the UAV's battery reaches."""
-
-
-def mask_absent(layout: Layout, present: Bool[Array, " n"]) -> Layout:
-    """Return the layout with the entries that are not ``present`` made inert: they need nothing and are far away.
-
-    The dynamics and the planners then need no special case for padding; only the choice of an action has to mask it.
-    """
-
-    def keep(value: Float[Array, " n"], padding: float) -> Float[Array, " n"]:
-        return jnp.where(present, value, padding)
-
-    return replace(
-        layout,
-        position=jnp.where(present[:, None], layout.position, _FAR_AWAY_M),
-        capacity=keep(layout.capacity, 1.0),
-        has_power=layout.has_power | ~present,
-        has_comms=layout.has_comms | ~present,
-        standby_power=keep(layout.standby_power, 0.0),
-        active_power=keep(layout.active_power, 0.0),
-        processing_rate=keep(layout.processing_rate, jnp.inf),
-        present=present,
-    )
-
-
-def pad_layout(layout: Layout, size: int) -> Layout:
-    """Append padding to a layout, so that layouts with different numbers of devices fit into one batch.
-
-    Args:
-        layout: ``n`` devices, without batch axes.
-        size: number of entries of the result, at least ``n``.
-
-    Raises:
-        ArgumentError: there are more than ``size`` devices.
-    """
-    chex.assert_rank(layout.capacity, 1)
-    check_range("size", size, ge=1, le=MAX_DEVICES, whole=True)
-    n = layout.capacity.shape[0]
-    if n > size:
-        raise ArgumentError(f"size is {size}; the layout has {n} devices: give {n} or more")
-
-    def pad(leaf: Array) -> Array:
-        return jnp.pad(jnp.asarray(leaf), ((0, size - n),) + ((0, 0),) * (jnp.ndim(leaf) - 1))
-
-    present = jnp.ones(n, bool) if layout.present is None else layout.present
-    traffic = layout.traffic
-    if traffic is not None:
-        traffic = replace(traffic, weight=jnp.pad(jnp.asarray(traffic.weight), ((0, 0), (0, size - n))))
-    padded = jax.tree.map(pad, replace(layout, traffic=None, present=None, fleet=None, depots=None))
-    return mask_absent(replace(padded, traffic=traffic, fleet=layout.fleet, depots=layout.depots), pad(present))

@@ -5,7 +5,6 @@ import math
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
@@ -18,7 +17,7 @@ from uavmec_jax.env.checks import (
     Check,
     check_range,
     check_ranges,
-    is_traced,
+    check_rising,
 )
 from uavmec_jax.env.types import Range, Scalar
 from uavmec_jax.errors import ArgumentError
@@ -129,9 +128,4 @@ def check_params(params: Params, name: str = "params") -> None:
             checks.append(Check(f"{name}.{field}", value, bounds))
     check_ranges(checks)
     for field in _RISING:
-        value = getattr(params, field)
-        if not isinstance(value, tuple | list) and np.shape(value)[:1] != (2,):
-            raise ArgumentError(f"{name}.{field} is {value!r}; it should be (low, high)")
-        low, high = value
-        if not is_traced((low, high)) and np.any(np.asarray(low) > np.asarray(high)):
-            raise ArgumentError(f"{name}.{field} is ({low}, {high}); it should be (low, high) with low <= high")
+        check_rising(f"{name}.{field}", getattr(params, field))

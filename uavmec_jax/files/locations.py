@@ -42,8 +42,9 @@ def to_path(location: str | Path, error: type[UserError] = StudyError) -> Path:
     """Return a location as a path: a :class:`pathlib.Path`, or for a URL an object that can do the same.
 
     Raises:
-        UserError: it holds a NUL character; for a URL, if universal-pathlib or the store's own package is not installed, the
-            protocol is unknown, or the URL was made a :class:`pathlib.Path`, which drops a slash; of the type ``error``.
+        UserError: it holds a NUL character or is too long; for a URL, if universal-pathlib or the store's own package is not
+            installed, the protocol is unknown, or the URL was made a :class:`pathlib.Path`, which drops a slash; of the type
+            ``error``.
     """
     text = str(location)
     if "\0" in text:
@@ -51,7 +52,9 @@ def to_path(location: str | Path, error: type[UserError] = StudyError) -> Path:
     if not is_url(text):
         if isinstance(location, Path) and _COLLAPSED_URL.match(text):
             raise error(f"{text}: looks like a URL that has lost a slash as a pathlib.Path; give it as text")
-        return Path(text[len(_LOCAL_URL) :] if _URL.match(text) else location)
+        path = Path(text[len(_LOCAL_URL) :] if _URL.match(text) else location)
+        _check_length(path, error)
+        return path
     options = {"use_listings_cache": False} if text.partition(":")[0].lower() in _CACHING else {}
     try:
         upath = importlib.import_module("upath")
@@ -63,6 +66,14 @@ def to_path(location: str | Path, error: type[UserError] = StudyError) -> Path:
     except ValueError as problem:
         raise error(f"{text}: {problem}") from None
     return cast(Path, path)
+
+
+def _check_length(path: Path, error: type[UserError]) -> None:
+    try:
+        path.lstat()
+    except OSError as problem:
+        if problem.errno == errno.ENAMETOOLONG:
+            raise error(f"{str(path)[:60]}...: {reason_of(problem)}; give a shorter path") from None
 
 
 def local_path(location: str | Path, needed_by: str) -> Path:

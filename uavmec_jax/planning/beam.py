@@ -99,6 +99,7 @@ def beam_search(
     """
     check_scenario(params, layout)
     check_volumes(volumes, layout.n_devices)
+    volumes = jnp.asarray(volumes)  # of NumPy, they could not be indexed with a traced slot
     check_range("width", width, ge=1, le=_MOST_STATES, whole=True)
     chex.assert_shape(volumes, (None, layout.capacity.shape[0]))
     if params.end != "first_failure":

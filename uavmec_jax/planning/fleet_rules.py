@@ -11,7 +11,8 @@ from jaxtyping import Array, Bool, Int, PRNGKeyArray
 
 from uavmec_jax.env.dynamics import State, complete_state, living_devices
 from uavmec_jax.env.fleet import UAV_FIELDS
-from uavmec_jax.env.layout import Layout, fleet_of, mask_absent
+from uavmec_jax.env.layout import Layout, fleet_of
+from uavmec_jax.env.padding import mask_absent
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Policy
 from uavmec_jax.planning.fleet_demand import is_alone

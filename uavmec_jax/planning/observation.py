@@ -16,7 +16,9 @@ from jaxtyping import Array, Bool, Float, Int
 from uavmec_jax.env.dynamics import State, slots_to_expiry
 from uavmec_jax.env.fixed_point import order_independent_sum
 from uavmec_jax.env.layout import Layout
-from uavmec_jax.env.params import Params, check_params
+from uavmec_jax.env.params import Params
+from uavmec_jax.env.scenario_checks import check_scenario
+from uavmec_jax.env.state_checks import check_state
 from uavmec_jax.planning import deadlines, demand
 from uavmec_jax.planning.demand import SlotCosts
 
@@ -91,10 +93,10 @@ def observe_devices(params: Params, layout: Layout, state: State) -> Observation
         state: before the slot.
 
     Raises:
-        ArgumentError: a parameter is out of range; one line.
+        ArgumentError: a parameter, or a value of the layout or the state, is out of range; one line.
     """
-    check_params(params)
-    chex.assert_equal_shape([layout.capacity, state.battery, state.age])
+    check_scenario(params, layout)
+    check_state(layout, state)
     n = layout.capacity.shape[0]
     mask = jnp.ones(n, bool) if layout.present is None else layout.present
     count = jnp.sum(mask).astype(jnp.float32)

@@ -122,6 +122,42 @@ def _column(tables: Sequence[Any], field: str, default: Any) -> Float[np.ndarray
     return np.array([default if (value := getattr(table, field)) is None else value for table in tables], np.float32)
 
 
+def device_tables(layout: Layout, names: Sequence[str]) -> list[dict[str, Any]]:
+    """Return devices, leaves ``[n]`` as NumPy arrays, as the tables of a scenario file; padding is left out.
+
+    Powers and rates are given where they are not those of the paper's tables.
+    """
+    present = np.ones(len(names), bool) if layout.present is None else layout.present
+    tables = []
+    for i in np.flatnonzero(present).tolist():
+        kind, task = int(layout.device_type[i]), int(layout.task[i])
+        table = _named(names[i], np.asarray(layout.position)[i]) | {
+            "type": None if kind == hardware.UNLISTED else hardware.DEVICE_TYPES[kind],
+            "task": None if task == hardware.UNLISTED else hardware.TASKS[task],
+            "capacity_j": float(layout.capacity[i]),
+            "power": bool(layout.has_power[i]),
+            "comms": bool(layout.has_comms[i]),
+        }
+        given = layout.standby_power[i], layout.active_power[i], layout.processing_rate[i]
+        unlisted = hardware.UNLISTED in (kind, task)
+        for field, value, listed in zip(_HARDWARE_FIELDS, given, _listed(kind, task), strict=True):
+            if unlisted or value != listed:
+                table[field] = float(value)
+        if layout.priority is not None:
+            table["priority"] = float(layout.priority[i])
+        tables.append(table)
+    return tables
+
+
+def _listed(kind: int, task: int) -> tuple[np.float32, np.float32, np.float32]:
+    """Return standby power, active power and processing rate of the paper's tables."""
+    return (
+        hardware.STANDBY_POWER_W[kind],
+        hardware.ACTIVE_POWER_W[task, kind],
+        hardware.PROCESSING_RATE_BYTES_S[task, kind],
+    )
+
+
 def depot_tables(depots: Depots | None) -> list[dict[str, Any]]:
     """Return depots, leaves ``[D]`` as NumPy arrays, as the tables of a scenario file; padding is left out."""
     if depots is None:
@@ -189,12 +225,7 @@ def _hardware(number: int, device: Device) -> tuple[float, float, float]:
                 f"{label('device', number, device.name)}: {field} {problem}; or give {', '.join(_HARDWARE_FIELDS)}"
             )
     kind, task = _index(device.type, hardware.DEVICE_TYPES), _index(device.task, hardware.TASKS)
-    listed = (
-        hardware.STANDBY_POWER_W[kind],
-        hardware.ACTIVE_POWER_W[task, kind],
-        hardware.PROCESSING_RATE_BYTES_S[task, kind],
-    )
     standby, active, rate = (
-        float(table if value is None else value) for value, table in zip(given, listed, strict=True)
+        float(table if value is None else value) for value, table in zip(given, _listed(kind, task), strict=True)
     )
     return standby, active, rate

@@ -9,14 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from uavmec_jax.env import hardware
+from uavmec_jax.env.checks import check_shape
 from uavmec_jax.env.dynamics import State, initial_state
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
+from uavmec_jax.env.scenario_checks import check_scenario
 from uavmec_jax.errors import ScenarioError, StateError
 from uavmec_jax.files.validation import validated
 from uavmec_jax.scenarios.hops import check_hops
-from uavmec_jax.scenarios.inventory import build_layout, check_inventory, depot_tables, uav_tables
+from uavmec_jax.scenarios.inventory import build_layout, check_inventory, depot_tables, device_tables, uav_tables
 from uavmec_jax.scenarios.region import (
     Positions,
     check_inside,
@@ -169,26 +170,17 @@ def name_scenario(
 ) -> NamedScenario:
     """Name a random scenario; its devices are ``device 1``, ``device 2``, ... unless ``device_names`` are given.
 
-    Depots and UAVs that are padding are left out, as are the packs of depots that charge and the power of those that swap.
+    What is padding is left out, as are the packs of depots that charge and the power of those that swap.
+
+    Raises:
+        ArgumentError: a parameter or a value of the layout is out of range, or there is not one name per device; one line.
     """
-    names = device_names or [f"device {number}" for number in range(1, len(layout.capacity) + 1)]
+    check_scenario(params, layout)
+    names = device_names or [f"device {number}" for number in range(1, layout.n_devices + 1)]
+    check_shape("device_names", names, (layout.n_devices,), "one per device")
     settings = {field: getattr(params, field) for field in ParamsSettings.model_fields if field != "n_devices"}
     changed = {field: value for field, value in settings.items() if value != getattr(Params(), field)}
     arrays = jax.tree.map(np.asarray, layout)
-    devices = [
-        {
-            "name": device_name,
-            "x_m": float(arrays.position[i, 0]),
-            "y_m": float(arrays.position[i, 1]),
-            "type": hardware.DEVICE_TYPES[arrays.device_type[i]],
-            "task": hardware.TASKS[arrays.task[i]],
-            "capacity_j": float(arrays.capacity[i]),
-            "power": bool(arrays.has_power[i]),
-            "comms": bool(arrays.has_comms[i]),
-            **({} if arrays.priority is None else {"priority": float(arrays.priority[i])}),
-        }
-        for i, device_name in enumerate(names)
-    ]
     depots = depot_tables(arrays.depots)
-    tables = {"device": devices, "depot": depots, "uav": uav_tables(arrays.fleet, params, depots)}
+    tables = {"device": device_tables(arrays, names), "depot": depots, "uav": uav_tables(arrays.fleet, params, depots)}
     return make_named_scenario({"name": name, "params": changed} | tables, name)

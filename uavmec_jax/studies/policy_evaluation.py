@@ -9,6 +9,7 @@ from jaxtyping import Array, Key
 
 from uavmec_jax.env.dynamics import Cause
 from uavmec_jax.env.rollout import Policy, rollouts
+from uavmec_jax.errors import ArgumentError
 from uavmec_jax.planning.fleet_demand import is_alone
 from uavmec_jax.planning.heuristics import HEURISTICS
 from uavmec_jax.scenarios.named_scenario import NamedScenario
@@ -37,7 +38,12 @@ def evaluate_policy(
         ``first_share``, its share of the first failures. For several UAVs, depots or a horizon also ``censored``, the share
         of the episodes that ``max_slots`` cuts off, and for a horizon ``service``, the mean share of the time to it in which
         the devices are in service, with the interval ``service_low``, ``service_high``.
+
+    Raises:
+        ArgumentError: the name is not text.
     """
+    if not isinstance(name, str):
+        raise ArgumentError(f"name is {name!r}; it should be text")
     policies = {name: policy} | {baseline: HEURISTICS[baseline] for baseline in _BASELINES}
     return [{"policy": label, **_evaluate(each, scenario, draws)} for label, each in policies.items()]
 
