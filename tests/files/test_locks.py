@@ -48,6 +48,15 @@ def test_one_at_a_time_in_one_process(tmp_path):
         pass
 
 
+def test_a_folder_that_is_a_link_is_refused(tmp_path):
+    (tmp_path / "victim").mkdir()
+    (tmp_path / "shards").symlink_to("victim")
+    message = rf"^{tmp_path}/shards: is a symbolic link, which is not followed; remove it$"
+    with pytest.raises(StudyError, match=message), lock_folder(tmp_path / "shards", tmp_path):
+        pass
+    assert list((tmp_path / "victim").iterdir()) == []
+
+
 def test_another_process_is_named_and_its_death_frees_the_folder(tmp_path, holder):
     for take_over in (False, True):  # a process that is alive here is not replaced
         with (

@@ -135,7 +135,7 @@ def test_a_link_that_leads_out_of_the_folder_is_refused(half, tmp_path, name):
     victim.mkdir()
     shutil.rmtree(half / name, ignore_errors=True)
     (half / name).symlink_to(victim)
-    with pytest.raises(StudyError, match=rf"{name}: is a symbolic link; a run writes into its own folder only"):
+    with pytest.raises(StudyError, match=rf"{name}: is a symbolic link, which is not followed; remove it"):
         resume_run(half)
     assert list(victim.iterdir()) == []
 

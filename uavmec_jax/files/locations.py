@@ -135,6 +135,16 @@ def absolute(path: Path) -> str:
     return os.path.abspath(path) if is_local(path) else str(path)
 
 
+def check_no_link(folder: Path) -> None:
+    """Refuse a folder that is a symbolic link: what is written there would go elsewhere.
+
+    Raises:
+        StudyError: it is one.
+    """
+    if is_local(folder) and folder.is_symlink():
+        raise StudyError(f"{folder}: is a symbolic link, which is not followed; remove it")
+
+
 def make_folder(path: Path) -> None:
     """Create a folder, unless there is one. In a store it comes with its first file, and a bucket is not created."""
     if is_local(path):

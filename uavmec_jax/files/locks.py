@@ -21,7 +21,7 @@ import psutil
 from filelock import FileLock, Timeout
 
 from uavmec_jax.errors import StudyError
-from uavmec_jax.files.locations import is_local, make_folder, store_errors
+from uavmec_jax.files.locations import check_no_link, is_local, make_folder, store_errors
 from uavmec_jax.files.reading import read_json_or_empty
 from uavmec_jax.files.writing import create_exclusively
 
@@ -83,9 +83,10 @@ def lock_folder(
         if_dead: what the message says is to be done about such an owner.
 
     Raises:
-        StudyError: another process holds it.
+        StudyError: another process holds it, or the folder is a symbolic link.
         OSError: the folder cannot be written to.
     """
+    check_no_link(folder)
     make_folder(folder)
     lock = _acquire(folder, of)
     try:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from uavmec_jax.errors import StudyError
-from uavmec_jax.files.locations import files_in_subfolders, is_local, names_in, reached
+from uavmec_jax.files.locations import check_no_link, files_in_subfolders, is_local, names_in, reached
 from uavmec_jax.files.locks import LOCK, OWNER, is_known_dead
 from uavmec_jax.files.parsing import read_json_object
 from uavmec_jax.files.reading import read_text
@@ -216,10 +216,7 @@ class RunFolder:
         folders = [self.path / name for name in (LOG, TENSORBOARD)]
         folders += [self.shards_folder, *(self.shard_folder(shard) for shard in self.plan.shards)]
         for folder in folders if is_local(self.path) else ():
-            if folder.is_symlink():
-                raise StudyError(
-                    f"{folder}: is a symbolic link; a run writes into its own folder only; remove the link"
-                )
+            check_no_link(folder)
 
     def agent_ids(self, shard: Shard) -> list[AgentId]:
         """Return the identities of a shard's agents."""
