@@ -39,6 +39,10 @@ LAYOUT = um.sample_layout(jax.random.key(0), PARAMS, 8, 8)
 STATE = um.initial_state(PARAMS, LAYOUT)
 VOLUMES = jnp.full(12, 3e6)
 DISTRIBUTION = ScenarioDistribution(PARAMS.replace(n_devices=16), um.make_reward())
+KEY = jax.random.key(0)
+OLDEST_FIRST = um.planning.HEURISTICS["oldest-first"]
+SCENARIO = um.make_scenario(LAYOUT, PARAMS)
+INFINITE = SCENARIO.reward.replace(traffic_bonus=jnp.float32(jnp.inf))
 NAMED = name_scenario(LAYOUT, PARAMS, "x")
 
 
@@ -140,6 +144,11 @@ def bad_distribution():
         lambda: um.planning.upper_bound(PARAMS.replace(uav_battery_j=2**31), LAYOUT, jnp.ones((33, 12)), 1),
         lambda: um.initial_state(PARAMS.replace(uav_battery_j=np.int64(2**31)), LAYOUT),
         lambda: um.initial_state(PARAMS.replace(count_unfinished_slot=1e300), LAYOUT),
+        lambda: um.env.rollout_from(OLDEST_FIRST, PARAMS, LAYOUT, STATE.replace(failed_at=jnp.full(12, jnp.nan)), KEY),
+        lambda: um.env.rollout_from(OLDEST_FIRST, PARAMS, LAYOUT, STATE.replace(packs=jnp.ones(3)), KEY),
+        lambda: um.env.rollout_from(OLDEST_FIRST, PARAMS, LAYOUT, STATE.replace(grounded=jnp.ones(1)), KEY),
+        lambda: um.env.rollout_draws(OLDEST_FIRST, SCENARIO.replace(reward=INFINITE), KEY[None]),
+        lambda: scenario_text(replace(NAMED, state=STATE.replace(elapsed=jnp.inf))),
         lambda: pad_layout(LAYOUT.replace(task=np.full(12, 1e300)), 13),
         lambda: sample_scenario(replace(DISTRIBUTION, uav_factor=(1e-320, 1.0)), jax.random.key(0)),
         lambda: sample_scenario(replace(DISTRIBUTION, devices=(4, 0)), jax.random.key(0)),
@@ -147,7 +156,7 @@ def bad_distribution():
         lambda: name_scenario(LAYOUT.replace(device_type=jnp.zeros(12)), PARAMS, "x"),
         lambda: name_scenario(LAYOUT, PARAMS, "x", ["a", "b"]),
         lambda: um.planning.observe_devices(PARAMS, LAYOUT, STATE.replace(uav_energy=jnp.ones(1, complex))),
-        lambda: evaluate_policy(um.planning.HEURISTICS["oldest-first"], 1j, NAMED, jax.random.key(0)[None]),
+        lambda: evaluate_policy(OLDEST_FIRST, 1j, NAMED, KEY[None]),
     ],
 )
 def test_values_of_another_kind(call):

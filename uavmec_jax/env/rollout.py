@@ -286,8 +286,13 @@ def rollout_draws(policy: Policy, scenario: Scenario | ScenarioDistribution, key
         policy: chooses each UAV's place in each slot.
         scenario: a scenario, or a distribution from which every key draws its own scenario.
         keys: draw the task volumes, and the scenarios if there is a distribution.
+
+    Raises:
+        ArgumentError: a value of the scenario or the distribution is out of range, or there are no keys; one line.
     """
+    check_range("the number of keys", len(keys), ge=1, whole=True)
     if isinstance(scenario, Scenario):
+        check_reward(scenario.reward)
         return rollouts(policy, scenario.params, scenario.layout, keys)
     return jax.vmap(lambda key: _rollout_draw(policy, scenario, key)[1])(keys)
 

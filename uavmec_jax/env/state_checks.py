@@ -2,16 +2,18 @@
 
 from typing import Any
 
-from uavmec_jax.env.checks import LARGEST, POSITION, Bounds, Check, check_ranges, check_shape
+from uavmec_jax.env.checks import LARGEST, POSITION, Bounds, Check, check_bool, check_ranges, check_shape
 from uavmec_jax.env.layout import Layout
 
 _ENERGY = Bounds(ge=0, le=LARGEST)
 _WHOLE = Bounds(ge=0, lt=2**31, whole=True)
+_FAILED_AT = Bounds(ge=-1, lt=2**31, whole=True)
+_PACKS = Bounds(ge=0, infinite=True)
 
 
 def state_checks(state: Any, name: str = "state") -> list[Check]:
     """Return the checks of all values of a :class:`State`."""
-    return [
+    checks = [
         Check(f"{name}.battery", state.battery, _ENERGY, ("device",)),
         Check(f"{name}.age", state.age, _WHOLE, ("device",)),
         Check(f"{name}.uav_energy", state.uav_energy, _ENERGY, ("UAV",)),
@@ -19,6 +21,11 @@ def state_checks(state: Any, name: str = "state") -> list[Check]:
         Check(f"{name}.slot", state.slot, _WHOLE),
         Check(f"{name}.elapsed", state.elapsed, Bounds(ge=0, le=LARGEST)),
     ]
+    optional = (
+        Check(f"{name}.failed_at", state.failed_at, _FAILED_AT, ("device",)),
+        Check(f"{name}.packs", state.packs, _PACKS, ("depot",)),
+    )
+    return checks + [check for check in optional if check.value is not None]
 
 
 def check_state(layout: Layout, state: Any, name: str = "state") -> None:
@@ -27,7 +34,7 @@ def check_state(layout: Layout, state: Any, name: str = "state") -> None:
     Raises:
         ArgumentError: one line that names the field and the device or UAV.
     """
-    n, uavs = layout.n_devices, layout.n_uavs
+    n, uavs, depots = layout.n_devices, layout.n_uavs, layout.n_depots
     for field, shape, what in (
         ("battery", (n,), "one per device"),
         ("age", (n,), "one per device"),
@@ -35,4 +42,13 @@ def check_state(layout: Layout, state: Any, name: str = "state") -> None:
         ("uav_position", (uavs, 2), "x and y of each UAV"),
     ):
         check_shape(f"{name}.{field}", getattr(state, field), shape, what)
+    for field, shape, what in (
+        ("grounded", (uavs,), "one per UAV"),
+        ("failed_at", (n,), "one per device"),
+        ("packs", (depots,), "one per depot"),
+    ):
+        if (value := getattr(state, field)) is not None:
+            check_shape(f"{name}.{field}", value, shape, what)
+    if state.grounded is not None:
+        check_bool(f"{name}.grounded", state.grounded)
     check_ranges(state_checks(state, name))

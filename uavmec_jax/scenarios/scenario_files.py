@@ -9,6 +9,7 @@ import numpy as np
 import tomli_w
 
 from uavmec_jax.env.scenario_checks import check_scenario
+from uavmec_jax.env.state_checks import check_state
 from uavmec_jax.errors import ScenarioError
 from uavmec_jax.files.parsing import parse_csv, parse_toml
 from uavmec_jax.files.reading import read_text
@@ -102,6 +103,7 @@ def scenario_text(scenario: NamedScenario, suffix: str = ".toml") -> str:
         ArgumentError: a value of the scenario cannot be; one line.
     """
     check_scenario(scenario.params, scenario.layout)
+    check_state(scenario.layout, scenario.state)
     file = scenario.file
     devices, depots, uavs = (
         [table.model_dump(exclude_none=True) for table in tables] for tables in (file.device, file.depot, file.uav)
