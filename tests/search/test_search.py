@@ -1,6 +1,7 @@
 """Hyperparameter search: spaces, successive halving, and searches that are stopped."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -84,6 +85,11 @@ def test_a_stopped_search_continues_to_the_same_result(space, tmp_path):
     assert overall(*pair(baseline, best))["difference"][0] == pytest.approx(gains.mean())
     again, _ = confirm(more, tmp_path / "whole")
     assert again.results.agents.shape == baseline.results.agents.shape
+    other = replace(more, best=more.best | {"reward.M": 0.123})  # as after more trials
+    with pytest.raises(
+        StudyError, match=r"best: holds a run of another study, perhaps of earlier settings; move it away$"
+    ):
+        confirm(other, tmp_path / "whole")
 
     (tmp_path / "whole" / "trials.db").write_bytes(b"SQLite no more" * 1000)
     with pytest.raises(StudyError, match=r"trials.db: cannot be used: file is not a database"):
