@@ -55,9 +55,9 @@ class Car(StrictModel):
 ERRORS = {
     "missing": ({}, "car.toml: wheels is missing"),
     "out of range": ({"wheels": 2}, "car.toml: wheels is 2; it should be greater than or equal to 3"),
-    "type": ({"wheels": "4"}, "car.toml: wheels is '4'; it should be a valid integer"),
+    "type": ({"wheels": "4"}, "car.toml: wheels is '4'; it should be a whole number"),
     "infinite": ({"wheels": 4, "engine": {"power_w": math.inf}}, "engine.power_w is inf; it should be a finite number"),
-    "union": ({"wheels": 4, "mirrors": 2.5}, "car.toml: mirrors is 2.5; it should be a valid integer"),
+    "union": ({"wheels": 4, "mirrors": 2.5}, "car.toml: mirrors is 2.5; it should be a whole number"),
     "key": ({"wheels": 4, "engin": {}}, "car.toml: engin is not a setting; did you mean 'engine'?"),
     "key called like a type": (
         {"wheels": 4, "engine": {"float": 1.0}},
@@ -122,7 +122,7 @@ ERRORS = {
     "too few": ({"wheels": 4, "cabin": {"bags": [1]}}, "cabin.bags is (1,); it should have at least 2 items, not 1"),
     "no table in a list of tables": ({"wheels": 4, "seat": [3]}, "car.toml: seat 1 (3): is 3; it should be"),
     "validator": ({"wheels": 4, "seat": [{"name": "a"}] * 4}, "car.toml: holds more than 3 seats"),
-    "no table": ([1], "car.toml: is [1]; it should be a valid dictionary"),
+    "no table": ([1], "car.toml: is [1]; it should be a table"),
 }
 
 
@@ -196,9 +196,9 @@ def test_a_model_has_the_fields_and_defaults_of_its_dataclasses():
         ({"limit": -1.0}, "limit is -1.0; it should be greater than or equal to 0"),
         ({"laps": 10}, "laps is 10; it should be less than or equal to 9"),
         ({"laps": -1}, "laps is -1; it should be greater than or equal to 0"),
-        ({"laps": True}, "laps is True; it should be a valid integer"),
+        ({"laps": True}, "laps is True; it should be a whole number"),
         ({"range_m": [-1.0, 2.0]}, "range_m: item 1 is -1.0; it should be greater than or equal to 0"),
-        ({"forward": 1}, "forward is 1; it should be a valid boolean"),
+        ({"forward": 1}, "forward is 1; it should be true or false"),
         ({"colour": "green"}, "colour is 'green'; it should be 'red' or 'blue'"),
         ({"ages": [20, 17]}, "ages: item 2 is 17; it should be greater than or equal to 18"),
         ({"secret": 1}, "secret is not a setting; did you mean 'speed'?"),

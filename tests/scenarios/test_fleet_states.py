@@ -49,12 +49,12 @@ def test_empty_file_is_the_initial_state(scenario):
 def test_uavs_by_name_and_in_order():
     gull = {"at": "lock camera", "energy_j": 1e6}
     tern = {"position_m": [12.5, 40.0], "grounded": True}
-    state = state_of({"uavs": {"tern": tern, "gull": gull}, "packs": {"pilot station": 2}, "slot": 3})
+    state = state_of({"uavs": {"tern": tern, "gull": gull}, "packs": {"pilot station": 2}, "slot": 3, "elapsed_s": 9.0})
     assert_array_equal(state.uav_position, [HARBOUR.layout.position[2], [12.5, 40]])
     assert_array_equal(state.uav_energy, [1e6, 9e5])
     assert state.grounded.tolist() == [False, True]
     assert state.packs.tolist() == [2]
-    chex.assert_trees_all_equal(state_of({"uavs": [gull, tern], "packs": [2], "slot": 3}), state)
+    chex.assert_trees_all_equal(state_of({"uavs": [gull, tern], "packs": [2], "slot": 3, "elapsed_s": 9.0}), state)
     tern_alone = state_of({"uavs": {"tern": {"energy_j": 0}}})
     assert_array_equal(tern_alone.uav_position, HARBOUR.state.uav_position)
     assert tern_alone.uav_energy.tolist() == [1_600_000, 0]
@@ -81,14 +81,14 @@ def test_a_uav_without_energy_is_grounded_unless_it_is_at_a_depot():
 
 def test_failed_devices_have_no_energy_and_data_of_any_age():
     ages = [3, 400, 0, 0, 99]
-    state = state_of({"failed_at": {"quay camera": 3}, "age_slots": ages, "slot": 9})
+    state = state_of({"failed_at": {"quay camera": 3}, "age_slots": ages, "slot": 9, "elapsed_s": 9.0})
     assert state.failed_at.tolist() == [-1, 3, -1, -1, -1]
     assert state.battery[1] == 0
     assert state.age.tolist() == [3, 400, 0, 0, 99]
     data = state_data(replace(HARBOUR, state=state))
     assert data["failed_at"] == {"quay camera": 3}
     assert data["battery_j"]["quay camera"] == 0
-    listed = state_of({"failed_at": [-1, 3, -1, -1, -1], "age_slots": ages, "slot": 9})
+    listed = state_of({"failed_at": [-1, 3, -1, -1, -1], "age_slots": ages, "slot": 9, "elapsed_s": 9.0})
     chex.assert_trees_all_equal(listed, state)
 
 
@@ -194,8 +194,8 @@ GULL = "uav 1 (gull): "
         ({"uavs": [{}, {"energy_j": 1e6}]}, "uav 2 (tern): energy_j is 1e+06; give from 0 to 900000"),
         ({"uavs": {"gull": {"energy_j": -1}}}, f"{GULL}energy_j is -1; give from 0 to"),
         ({"uavs": {"gull": {"energy_j": NAN}}}, f"{GULL}energy_j is nan; give from 0 to"),
-        ({"uavs": {"gull": {"energy_j": "full"}}}, "uavs.gull.energy_j is 'full'; it should be a valid number"),
-        ({"uavs": {"gull": {"grounded": 1}}}, "uavs.gull.grounded is 1; it should be a valid boolean"),
+        ({"uavs": {"gull": {"energy_j": "full"}}}, "uavs.gull.energy_j is 'full'; it should be a number"),
+        ({"uavs": {"gull": {"grounded": 1}}}, "uavs.gull.grounded is 1; it should be true or false"),
         ({"uavs": [{"energi_j": 1}, {}]}, "uavs.gull.energi_j is not a setting; did you mean 'energy_j'?"),
         ({"uavs": 3}, "uavs is 3; it should be"),
         ({"packs": {"port": 1}}, "packs names 'port'; the depots are pilot station"),
@@ -229,6 +229,8 @@ GULL = "uav 1 (gull): "
             f"age_slots.{NAMES[0]} is 1000000000000; it should be less than or equal to 2147483647",
         ),
         ({"elapsed_s": 30_000}, "elapsed_s is 30000; the horizon is 21600 s; give less"),
+        ({"slot": 3}, "elapsed_s is missing, but slot is 3; give the seconds that these slots took"),
+        ({"slot": 1000, "elapsed_s": 9.0}, "slot is 1000; episodes end after params.max_slots = 1000 slots; give less"),
         ({"slot": 10**12}, "slot is 1000000000000; it should be less than or equal to 1000000"),
     ],
 )

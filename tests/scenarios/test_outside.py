@@ -57,7 +57,7 @@ def test_an_unknown_column_beside_the_known_ones_is_named(tmp_path):
     ("old", "new", "message"),
     [
         ("9.981", "9,981", "line 3 has 7 cells; there are 6 columns"),
-        ("9.981", "east", "device 2 (south): lon is 'east'; it should be a valid number"),
+        ("9.981", "east", "device 2 (south): lon is 'east'; it should be a number"),
         ("9.981", "nan", "device 2 (south): lon is nan; it should be a finite number"),
         ("south", "", "device 2 (no name): name is missing"),
         ("south", "north", "device 2: name is 'north', which another device has"),
@@ -77,7 +77,7 @@ def test_a_row_that_is_not_right_is_named(tmp_path, old, new, message):
 
 def test_a_decimal_comma_among_semicolons_is_named(tmp_path):
     path = write(tmp_path, COMMAS.replace(",", ";").replace("9.981", "9,981"), "devices.csv")
-    assert "device 2 (south): lon is '9,981'; it should be a valid number" in refused(path)
+    assert "device 2 (south): lon is '9,981'; it should be a number" in refused(path)
 
 
 DEEP = "[" * 20_000 + "]" * 20_000
@@ -125,10 +125,10 @@ BAD_TOML = {
     "name of the scenario": (f'name = "a\\nb"\n{DEVICE}', "name is 'a\\nb'; it should be one line"),
     "array as a number": (
         DEVICE.replace("5e4", "[1, 2]"),
-        "device 1 (a): capacity_j is [1, 2]; it should be a valid number",
+        "device 1 (a): capacity_j is [1, 2]; it should be a number",
     ),
-    "table as a list": ("device = 3\n", "device is 3; it should be a valid tuple"),
-    "number as params": (f"params = 3\n{DEVICE}", "params is 3; it should be a valid dictionary"),
+    "table as a list": ("device = 3\n", "device is 3; it should be an array"),
+    "number as params": (f"params = 3\n{DEVICE}", "params is 3; it should be a table"),
 }
 
 
@@ -170,7 +170,7 @@ BAD_STATES = {
     "deep": ("[" * 200_000, "is nested too deep"),
     "deep in an object": (f'{{"battery_j": {"[" * 20_000}{"]" * 20_000}}}', "is nested too deep"),
     "text": ('{"battery_j": "full"}', "battery_j is 'full'"),
-    "truth": ('{"slot": true}', "slot is True; it should be a valid integer"),
+    "truth": ('{"slot": true}', "slot is True; it should be a whole number"),
     "uavs": ('{"uavs": [3]}', "uavs"),
     "null": ("null", "holds null; it should hold an object"),
     "empty": ("", "not JSON"),

@@ -88,12 +88,12 @@ def test_the_good_file_and_the_shipped_policy_are_read_to_the_bit(tmp_path):
 BAD_HEADERS = {
     "no settings": ({"settings": None}, "its header has no settings"),
     "empty settings": ({"settings": {}}, "settings is {}"),
-    "settings as a list": ({"settings": [1]}, "settings is [1]; it should be a valid dictionary"),
+    "settings as a list": ({"settings": [1]}, "settings is [1]; it should be a table"),
     "unknown algorithm": ({"settings.sarsa": {}}, "settings.sarsa is not an algorithm of this version; known: dqn"),
     "algorithm without agents": ({"settings.ppo": {}}, "agents.ppo is missing; settings.ppo is given"),
     "agents without settings": ({"agents.ppo": [{"seed": 0}]}, "settings.ppo is missing; agents.ppo is given"),
     "unknown setting": ({"settings.dqn.gama": 0.9}, "settings.dqn: gama is not a setting; did you mean 'gamma'?"),
-    "text as a number": ({"settings.dqn.gamma": "high"}, "settings.dqn: gamma is 'high'; it should be a valid number"),
+    "text as a number": ({"settings.dqn.gamma": "high"}, "settings.dqn: gamma is 'high'; it should be a number"),
     "out of bounds": ({"settings.dqn.age_scale": -1.0}, "settings.dqn: age_scale is -1.0; it should be greater than 0"),
     "tiny": (
         {"settings.dqn.age_scale": 1e-300},
@@ -111,10 +111,10 @@ BAD_HEADERS = {
     "no devices": ({"n_devices": 0}, "n_devices is 0; it should be greater than or equal to 1"),
     "many devices": ({"n_devices": 10**9}, "n_devices is 1000000000; it should be less than or equal to 1000"),
     "other devices": ({"n_devices": 11}, "its weights do not fit its dqn network of this version"),
-    "devices as text": ({"n_devices": "12"}, "n_devices is '12'; it should be a valid integer"),
+    "devices as text": ({"n_devices": "12"}, "n_devices is '12'; it should be a whole number"),
     "no agents": ({"agents.dqn": []}, "agents.dqn is []"),
-    "agents as a number": ({"agents": 3}, "agents is 3; it should be a valid dictionary"),
-    "agent as a number": ({"agents.dqn.1": 3}, "agents.dqn: item 2 is 3; it should be a valid dictionary"),
+    "agents as a number": ({"agents": 3}, "agents is 3; it should be a table"),
+    "agent as a number": ({"agents.dqn.1": 3}, "agents.dqn: item 2 is 3; it should be a table"),
     "one agent too many": ({"agents.dqn": HEADER["agents"]["dqn"] * 2}, "its weights do not fit its dqn network"),
     "table in an agent": ({"agents.dqn.0.seed": {"a": 1}}, "agents.dqn: item 1: seed is {'a': 1}"),
     "agent's own setting": (
@@ -183,7 +183,7 @@ def test_the_shapes_of_a_large_network_take_no_memory():
 def test_the_header_of_a_run_is_as_strict(tmp_path):
     (tmp_path / "run").mkdir()
     write_with(tmp_path / "run" / "weights.npz", {"n_devices": True})
-    with pytest.raises(PolicyError, match="n_devices is True; it should be a valid integer"):
+    with pytest.raises(PolicyError, match="n_devices is True; it should be a whole number"):
         load_policy(tmp_path / "run", seed=0)
 
 

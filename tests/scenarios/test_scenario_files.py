@@ -140,7 +140,7 @@ def test_bad_scenario_is_refused_in_one_line(tmp_path, text, message):
     [
         (
             "name,x_m,y_m,type,task,capacity_j\na,1,2,Firefly,DNN,abc\n",
-            "capacity_j is 'abc'; it should be a valid number",
+            "capacity_j is 'abc'; it should be a number",
         ),
         ("name,x_m,y_m,type,task,capacity_j,power\na,1,2,Firefly,DNN,5,maybe\n", "power is 'maybe'"),
         ("name,x_m\na,1,2,3\n", "line 2 has 4 cells; there are 2 columns"),

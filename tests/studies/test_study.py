@@ -109,9 +109,9 @@ def test_scenario_parameters_and_devices_are_settings():
 BAD = [
     ({"colour": "red"}, "bad.toml: colour is not a setting"),
     ({"dqn.gama": 0.9}, "bad.toml: dqn.gama is not a setting; did you mean 'gamma'?"),
-    ({"steps": "many"}, "bad.toml: steps is 'many'; it should be a valid integer"),
+    ({"steps": "many"}, "bad.toml: steps is 'many'; it should be a whole number"),
     ({"steps": 0}, "bad.toml: steps is 0; it should be greater than or equal to 1"),
-    ({"steps": 1.5}, "bad.toml: steps is 1.5; it should be a valid integer"),
+    ({"steps": 1.5}, "bad.toml: steps is 1.5; it should be a whole number"),
     ({"dqn.learning_rate": float("nan")}, "bad.toml: dqn.learning_rate is nan; it should be a finite number"),
     ({"dqn.learning_rate": -0.1}, "bad.toml: dqn.learning_rate is -0.1; it should be greater than 0"),
     ({"dqn.train_frequency": 0}, "bad.toml: dqn.train_frequency is 0"),

@@ -90,7 +90,7 @@ BAD_ARRAYS = {
 BAD_FACTS = {
     "missing": ({"names": None}, "meta.names is missing"),
     "unknown": ({"colour": "red"}, "meta.colour is not a setting"),
-    "names of numbers": ({"names": ["a", 2, "c"]}, "meta.names: item 2 is 2; it should be a valid string"),
+    "names of numbers": ({"names": ["a", 2, "c"]}, "meta.names: item 2 is 2; it should be text"),
     "empty name": ({"names": ["a", "", "c"]}, "meta.names: item 2 is ''; it should have at least 1 character"),
     "same name twice": ({"names": ["a", "b", "a"]}, "meta.names has 'a' twice; they must differ"),
     "name that a terminal obeys": (
@@ -101,9 +101,12 @@ BAD_FACTS = {
     "one name": ({"names": ["a"]}, "meta.names is ('a',); it should have at least 2 items, not 1"),
     "same road twice": ({"roads": ["a", "a"]}, "meta.roads has 'a' twice; they must differ"),
     "description of two lines": ({"description": "a\nb"}, "meta.description is 'a\\nb'; it should be one line"),
-    "string windows": ({"mean_windows": ["0", "2"]}, "meta.mean_windows: item 1 is '0'; it should be a valid integer"),
+    "string windows": ({"mean_windows": ["0", "2"]}, "meta.mean_windows: item 1 is '0'; it should be a whole number"),
     "windows that are not whole": ({"mean_windows": [0.0, 2.0]}, "meta.mean_windows: item 1 is 0.0; it should be a"),
-    "windows of truth": ({"mean_windows": [False, True]}, "meta.mean_windows: item 1 is False; it should be a valid"),
+    "windows of truth": (
+        {"mean_windows": [False, True]},
+        "meta.mean_windows: item 1 is False; it should be a whole number",
+    ),
     "negative window": ({"mean_windows": [-1, 2]}, "meta.mean_windows: item 1 is -1; it should be greater than or"),
     "no window": ({"mean_windows": [1, 1]}, "meta.mean_windows is [1, 1]; give the first window and one past the last"),
     "windows after the end": (
@@ -114,16 +117,16 @@ BAD_FACTS = {
         {"mean_s": [0.0, 60.0]},
         "meta.mean_s is [0.0, 60.0]; windows 0 to 2 of 600 s are [0, 1200]",
     ),
-    "string window": ({"window_s": "600"}, "meta.window_s is '600'; it should be a valid number"),
+    "string window": ({"window_s": "600"}, "meta.window_s is '600'; it should be a number"),
     "no length of a window": ({"window_s": 0.0}, "meta.window_s is 0.0; it should be greater than 0"),
     "endless window": ({"window_s": 1e300}, "meta.window_s is 1e+300; it should be less than or equal to 10000000"),
     "negative radius": ({"radius_m": -1.0}, "meta.radius_m is -1.0; it should be greater than 0"),
     "counts of other seeds": ({"teleports": [1]}, "meta.teleports has 1 numbers; there are 2 seeds"),
     "negative count": ({"loaded": [10, -1]}, "meta.loaded: item 2 is -1; it should be greater than or equal to 0"),
-    "warnings of numbers": ({"warnings": [1]}, "meta.warnings: item 1 is 1; it should be a valid string"),
+    "warnings of numbers": ({"warnings": [1]}, "meta.warnings: item 1 is 1; it should be text"),
     "hash": ({"network_sha256": "0" * 63}, "meta.network_sha256 is"),
-    "settings": ({"settings": []}, "meta.settings is []; it should be a valid dictionary"),
-    "place": ({"place": 7}, "meta.place is 7; it should be a valid string"),
+    "settings": ({"settings": []}, "meta.settings is []; it should be a table"),
+    "place": ({"place": 7}, "meta.place is 7; it should be text"),
 }
 
 

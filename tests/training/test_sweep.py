@@ -80,7 +80,7 @@ def test_the_preset_is_the_study():
         ({"hyper": {"gamma": -3}}, "hyper.gamma is -3; it should be a finite number from 0 to 1"),
         ({"settings": {"batch_size": 0}}, "settings: batch_size is 0; it should be greater than or equal to 1"),
         ({"settings": {"hidden": (0,)}}, "settings: hidden: item 1 is 0; it should be greater than or equal to 1"),
-        ({"settings": {"double": "yes"}}, "settings: double is 'yes'; it should be a valid boolean"),
+        ({"settings": {"double": "yes"}}, "settings: double is 'yes'; it should be true or false"),
         ({"steps": 0}, "steps is 0; it should be a whole number from 1 to 2000000000"),
         ({"steps": 3 * 10**9}, "steps is 3000000000; it should be a whole number from 1 to 2000000000"),
         (

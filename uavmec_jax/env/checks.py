@@ -152,15 +152,23 @@ def check_shape(name: str, value: Any, shape: tuple[int, ...], what: str) -> Non
         raise ArgumentError(f"{name} has shape {found}; it should be {shape}, {what}")
 
 
+def check_pair(name: str, value: Any) -> None:
+    """Check that a value is two numbers, or two arrays of a batch.
+
+    Raises:
+        ArgumentError: one line.
+    """
+    if (len(value) if isinstance(value, tuple | list) else (*np.shape(value), 0)[0]) != 2:
+        raise ArgumentError(f"{name} is {value!r}; it should be two numbers")
+
+
 def check_rising(name: str, value: Any) -> None:
     """Check that a range is two numbers, ``(low, high)``, of which the second is not the smaller one, if they are known.
 
     Raises:
         ArgumentError: one line.
     """
-    numbers = len(value) if isinstance(value, tuple | list) else (*np.shape(value), 0)[0]
-    if numbers != 2:
-        raise ArgumentError(f"{name} is {value!r}; it should be (low, high)")
+    check_pair(name, value)
     low, high = value
     if not is_traced((low, high)) and np.any(np.asarray(low) > np.asarray(high)):
         raise ArgumentError(f"{name} is ({low}, {high}); it should be (low, high) with low <= high")
@@ -213,6 +221,19 @@ def check_volumes(volumes: Any, n_devices: int) -> None:
     """
     check_shape("volumes", volumes, (n_devices,), "one per device")
     check_ranges([volumes_check(volumes)])
+
+
+def check_volume_table(volumes: Any, n_devices: int, batch: tuple[int, ...] = ()) -> None:
+    """Check the task volumes of a number of slots, ``[*batch, H, n]``, bytes, of which there is at least one.
+
+    Raises:
+        ArgumentError: one line. Of traced volumes, only the shape is checked; see :func:`debug_checks`.
+    """
+    check_volumes(volumes, n_devices)
+    shape = tuple(np.shape(volumes))
+    if len(shape) != len(batch) + 2 or shape[:-2] != batch or shape[-2] == 0:
+        axes = ", ".join((*map(str, batch), "slots", str(n_devices)))
+        raise ArgumentError(f"volumes has shape {shape}; it should be ({axes}), with one slot or more")
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from uavmec_jax.env.checks import (
     SMALLEST,
     Bounds,
     Check,
+    check_pair,
     check_range,
     check_ranges,
     check_rising,
@@ -127,5 +128,6 @@ def check_params(params: Params, name: str = "params") -> None:
         else:
             checks.append(Check(f"{name}.{field}", value, bounds))
     check_ranges(checks)
+    check_pair(f"{name}.region_m", params.region_m)
     for field in _RISING:
         check_rising(f"{name}.{field}", getattr(params, field))

@@ -39,12 +39,12 @@ def make_weights(terms: Mapping[str, float]) -> np.ndarray:
     """Turn ``{"U": 1.0, "log A": 1.0}`` into a weight vector ``[8]``.
 
     Raises:
-        ValueError: a term is not one of :data:`TERMS`, or a weight is not finite.
+        ArgumentError: a term is not one of :data:`TERMS`, or a weight is not finite.
     """
     weights = np.zeros(len(TERMS), np.float32)
     for term, weight in terms.items():
         if term not in TERMS:
-            raise ValueError(f"unknown reward term {term!r}; terms are {', '.join((*TERMS, SERVICE_TERM))}")
+            raise ArgumentError(f"unknown reward term {term!r}; terms are {', '.join((*TERMS, SERVICE_TERM))}")
         weights[TERMS.index(term)] = _finite(term, weight)
     weights.setflags(write=False)
     return weights
@@ -123,11 +123,11 @@ def make_reward(
         per_slot: added for every slot that counts; ``make_reward({}, per_slot=1.0)`` is the lifetime.
 
     Raises:
-        ValueError: the name, a term or the guard is unknown, a number is not finite, or the function does not return a
+        ArgumentError: the name, a term or the guard is unknown, a number is not finite, or the function does not return a
             scalar.
     """
     if guard not in LOG_GUARDS:
-        raise ValueError(f"unknown log guard {guard!r}; guards are {', '.join(LOG_GUARDS)}")
+        raise ArgumentError(f"unknown log guard {guard!r}; guards are {', '.join(LOG_GUARDS)}")
     numbers = {"traffic_bonus": traffic_bonus, "traffic_penalty": traffic_penalty, "per_slot": per_slot}
     check_ranges([Check(name, value, Bounds()) for name, value in numbers.items()])
     common = {
@@ -142,8 +142,10 @@ def make_reward(
     service = None
     if isinstance(reward, str):
         if reward not in REWARDS:
-            raise ValueError(f"unknown reward {reward!r}; rewards are {', '.join(REWARDS)}")
+            raise ArgumentError(f"unknown reward {reward!r}; rewards are {', '.join(REWARDS)}")
         weights = REWARDS[reward]
+    elif not isinstance(reward, Mapping):
+        raise ArgumentError(f"reward is {reward!r}; it should be a name, weights of terms, or a function")
     else:
         weights = make_weights({term: weight for term, weight in reward.items() if term != SERVICE_TERM})
         if SERVICE_TERM in reward:
@@ -159,9 +161,9 @@ def _check_function(function: Callable[[Mapping[str, Any]], Any]) -> None:
         result = jax.eval_shape(lambda terms: jnp.asarray(function(terms)), terms)
     except KeyError as error:
         known = ", ".join((*TERMS, SERVICE_TERM))
-        raise ValueError(f"the reward function asks for the term {error}; terms are {known}") from None
+        raise ArgumentError(f"the reward function asks for the term {error}; terms are {known}") from None
     if result.shape != ():
-        raise ValueError(f"the reward function returns an array of shape {result.shape}; it should return a scalar")
+        raise ArgumentError(f"the reward function returns an array of shape {result.shape}; it should return a scalar")
 
 
 def needs_guard(reward: str | Mapping[str, float]) -> bool:
@@ -188,13 +190,13 @@ def check_guard(reward: Reward, layout: Layout) -> None:
     """Check that a reward has no bare logarithm of an age if there are depots; traced rewards pass.
 
     Raises:
-        ValueError: one line.
+        ArgumentError: one line.
     """
     if not layout.n_depots or isinstance(reward.weights, jax.core.Tracer) or isinstance(reward.log1p, jax.core.Tracer):
         return
     ages = np.asarray(reward.weights)[..., [TERMS.index("log A"), TERMS.index("log O")]]
     if np.any(np.any(ages != 0, axis=-1) & ~np.asarray(reward.log1p)):
-        raise ValueError(
+        raise ArgumentError(
             "the reward has log A or log O and the guard clamp, but with depots A is 0 when every UAV is at one; "
             "give guard='log1p'"
         )

@@ -18,6 +18,7 @@ from uavmec_jax.env.scenario import Scenario, advance, draw_volumes
 from uavmec_jax.env.scenario_checks import check_scenario
 from uavmec_jax.env.state_checks import check_state
 from uavmec_jax.env.types import Scalar
+from uavmec_jax.errors import ArgumentError
 
 Policy = Callable[..., Array]
 """``policy(params, layout, state, key=None) -> action``, an int32 place in ``[0, n + D)``, one per UAV (``[K]``) if there
@@ -47,6 +48,19 @@ class Episode:
     first_failure: Float[Array, "*batch n"]
     lasted: Scalar = 1.0
     service_s: Float[Array, "*batch"] | None = None
+
+
+def check_policy(policy: object) -> None:
+    """Check that a policy is a function, and not the name of one.
+
+    Raises:
+        ArgumentError: one line.
+    """
+    if not callable(policy):
+        raise ArgumentError(
+            f"policy is {policy!r}; it should be a function such as um.planning.HEURISTICS['oldest-first'] or "
+            "um.load_policy('generalist')"
+        )
 
 
 def slot_volumes(params: Params, n_devices: int, key: PRNGKeyArray, slot: Int[ArrayLike, ""]) -> Float[Array, " n"]:
@@ -89,6 +103,7 @@ def rollout_from(policy: Policy, params: Params, layout: Layout, state: State, k
     Raises:
         ArgumentError: as in :func:`rollout`, and for the state.
     """
+    check_policy(policy)
     check_scenario(params, layout)
     check_state(layout, state)
     return _play(policy, params, layout, state, key, slots=0)[1]

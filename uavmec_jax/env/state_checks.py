@@ -2,8 +2,9 @@
 
 from typing import Any
 
-from uavmec_jax.env.checks import LARGEST, POSITION, Bounds, Check, check_bool, check_ranges, check_shape
+from uavmec_jax.env.checks import LARGEST, POSITION, Bounds, Check, check_bool, check_ranges, check_shape, is_traced
 from uavmec_jax.env.layout import Layout
+from uavmec_jax.env.scenario_checks import check_scenario
 
 _ENERGY = Bounds(ge=0, le=LARGEST)
 _WHOLE = Bounds(ge=0, lt=2**31, whole=True)
@@ -26,6 +27,17 @@ def state_checks(state: Any, name: str = "state") -> list[Check]:
         Check(f"{name}.packs", state.packs, _PACKS, ("depot",)),
     )
     return checks + [check for check in optional if check.value is not None]
+
+
+def check_decision(params: Any, layout: Layout, state: Any) -> None:
+    """Check all that a policy decides on, unless any of it is traced.
+
+    Raises:
+        ArgumentError: one line.
+    """
+    if not is_traced((params, layout, state)):
+        check_scenario(params, layout)
+        check_state(layout, state)
 
 
 def check_state(layout: Layout, state: Any, name: str = "state") -> None:

@@ -60,6 +60,18 @@ _BOUNDS = ("gt", "ge", "lt", "le")
 _TYPE_TAG = re.compile(r"int|str|float|bool|(constrained-|tuple\[|dict\[|list\[|function-).*", re.DOTALL)
 """Parts that pydantic adds to the location of an error in a union."""
 
+_WORDS = {
+    "boolean": "true or false",
+    "tuple": "an array",
+    "list": "an array",
+    "dictionary": "a table",
+    "integer": "a whole number",
+    "number": "a number",
+    "string": "text",
+}
+_KINDS = re.compile(rf"\ba valid ({'|'.join(_WORDS)})\b( or instance of \w+)?")
+"""What pydantic calls Python's types, and the words of TOML that users know."""
+
 _SUBJECT = re.compile(r"\b(Input|String|Tuple|List|Dictionary) should")
 """What pydantic calls a value that should be something else."""
 
@@ -132,6 +144,7 @@ def suggest(word: str, options: Iterable[str]) -> str:
 def expectation(error: Any) -> str:
     """Return what one of pydantic's errors says that the value should be."""
     message = _SUBJECT.sub("it should", error["msg"], count=1)
+    message = _KINDS.sub(lambda kind: _WORDS[kind[1]], message, count=1)
     return message.replace(" after validation", "").replace("Value error, ", "")
 
 

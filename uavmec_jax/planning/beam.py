@@ -20,13 +20,12 @@ uploads take longer than computing, rule 2 is heuristic as well.)
 from functools import partial
 from typing import NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Int, Num
 
-from uavmec_jax.env.checks import check_range, check_volumes
+from uavmec_jax.env.checks import check_range, check_volume_table
 from uavmec_jax.env.dynamics import Cause, Outcome, State, initial_state, transition
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
@@ -98,10 +97,9 @@ def beam_search(
         ValueError: episodes do not end with the first failure.
     """
     check_scenario(params, layout)
-    check_volumes(volumes, layout.n_devices)
+    check_volume_table(volumes, layout.n_devices)
     volumes = jnp.asarray(volumes)  # of NumPy, they could not be indexed with a traced slot
     check_range("width", width, ge=1, le=_MOST_STATES, whole=True)
-    chex.assert_shape(volumes, (None, layout.capacity.shape[0]))
     if params.end != "first_failure":
         raise ValueError(f"end is {params.end!r}; the beam searches for the longest time to the 'first_failure'")
     problem = make_problem(params, layout, volumes, value_fn)

@@ -34,13 +34,12 @@ of hovering at each UAV's own least power. Integrality is kept in the rows that 
 with one UAV, the mixed-integer program gained nothing.
 """
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, Num
 
-from uavmec_jax.env.checks import check_range, check_volumes
+from uavmec_jax.env.checks import check_range, check_volume_table
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.scenario_checks import check_scenario
@@ -67,7 +66,7 @@ def upper_bound(params: Params, layout: Layout, volumes: Num[Array, "H n"], reac
         ValueError: the volumes end before a lifetime may, or episodes do not end with the first failure.
     """
     check_scenario(params, layout)  # here without the batch's axis, so that the message names the device
-    check_volumes(volumes, layout.n_devices)
+    check_volume_table(volumes, layout.n_devices)
     check_range("reached", reached, ge=0, lt=2**31, whole=True)
     params, layout, volumes = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], (params, layout, volumes))
     return int(upper_bounds(params, layout, volumes, np.array([reached]))[0])
@@ -78,9 +77,8 @@ def upper_bounds(
 ) -> Int[np.ndarray, " B"]:
     """Return the :func:`upper_bound` of each of ``B`` scenarios; every leaf has a leading ``B``."""
     check_scenario(params, layouts)
-    check_volumes(volumes, layouts.n_devices)
     check_range("reached", reached, ge=0, axes=("scenario",))
-    chex.assert_shape(volumes, (len(reached), None, layouts.n_devices))
+    check_volume_table(volumes, layouts.n_devices, (len(reached),))
     if params.end != "first_failure":
         raise ValueError(f"end is {params.end!r}; upper bounds on lifetimes are for 'first_failure'")
     slots, max_slots = volumes.shape[1], np.broadcast_to(params.max_slots, len(reached))

@@ -16,8 +16,9 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num, PRNGKeyArray
 
 from uavmec_jax.env.dynamics import State, complete_state, initial_state, slots_to_expiry
 from uavmec_jax.env.layout import Layout
-from uavmec_jax.env.params import Params, check_params
+from uavmec_jax.env.params import Params
 from uavmec_jax.env.products import product
+from uavmec_jax.env.state_checks import check_decision
 from uavmec_jax.planning import demand, fleet_demand
 from uavmec_jax.planning.deadlines import earliest_deadline as of_one_uav
 from uavmec_jax.planning.deadlines import feasible_horizon
@@ -54,9 +55,9 @@ def earliest_deadline(params: Params, layout: Layout, state: State, key: PRNGKey
     UAV and no depots the rule is :func:`deadlines.earliest_deadline`.
 
     Raises:
-        ArgumentError: a parameter is out of range; one line.
+        ArgumentError: a number of the scenario or the state is out of range; one line.
     """
-    check_params(params)
+    check_decision(params, layout, state)
     state = complete_state(layout, state)
     living, seen = _see_living(params, layout, state)
     if fleet_demand.is_alone(layout):

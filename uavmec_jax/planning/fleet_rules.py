@@ -15,6 +15,7 @@ from uavmec_jax.env.layout import Layout, fleet_of
 from uavmec_jax.env.padding import mask_absent
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Policy
+from uavmec_jax.env.state_checks import check_decision
 from uavmec_jax.planning.fleet_demand import is_alone
 from uavmec_jax.planning.returns import Returns, plan_returns, send
 
@@ -81,10 +82,12 @@ def for_fleets(rule: Policy) -> Policy:
     UAVs decide in turn by the rule, in a network in which the devices already cared for are fresh and fully charged; their
     slots are numbered on, so that rules that count slots do not send all to the same device. With one UAV and no depots the
     policy is the rule itself. Where episodes go on after a failure, the rule does not see the devices that are out for good.
+    The policy raises ArgumentError if a number of the scenario or the state is out of range.
     """
 
     @wraps(rule)
     def policy(params: Params, layout: Layout, state: State, key: PRNGKeyArray | None = None) -> Array:
+        check_decision(params, layout, state)
         state = complete_state(layout, state)
         living, seen = see_living(params, layout, state)
         if is_alone(layout):

@@ -16,6 +16,7 @@ from uavmec_jax.env.dynamics import State
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Policy
+from uavmec_jax.env.state_checks import check_decision
 from uavmec_jax.errors import PolicyError
 from uavmec_jax.files.archives import MAX_BYTES, MAX_USER_BYTES
 from uavmec_jax.files.locations import StoreError, reached, reason_of
@@ -98,7 +99,9 @@ class TrainedPolicy:
 
         Raises:
             PolicyError: the layout has another number of devices.
+            ArgumentError: a number of the scenario or the state is out of range; one line. Traced ones are not checked.
         """
+        check_decision(params, layout, state)
         if self.n_devices not in (None, layout.capacity.shape[-1]):
             raise PolicyError(
                 f"the policy was trained for {self.n_devices} devices; the layout has {layout.capacity.shape[-1]}"

@@ -86,9 +86,7 @@ def _build(file: StateFile, scenario: NamedScenario) -> State:
     battery = by_name("battery_j", file.battery_j, full, names, "device")
     age = by_name("age_slots", file.age_slots, np.asarray(initial.age), names, "device")
     _check_failures(file, failed_at, scenario)
-    horizon = float(scenario.params.horizon_s)
-    if scenario.params.end == "horizon" and file.elapsed_s >= horizon:
-        raise ValueError(f"elapsed_s is {file.elapsed_s:g}; the horizon is {horizon:g} s; give less")
+    _check_time(file, scenario)
     _check_devices(battery, age, failed_at, scenario)
     position, energy, grounded = uav_arrays(file, scenario)
     return State(
@@ -116,6 +114,20 @@ def _check_failures(file: StateFile, failed_at: Int[np.ndarray, " n"], scenario:
                 f"device {number} ({name}): failed_at is {slot}; give 0 to {file.slot}, the number of completed slots, "
                 "or -1 if it works"
             )
+
+
+def _check_time(file: StateFile, scenario: NamedScenario) -> None:
+    """Check that the episode is not over, and that time has passed in the slots that are completed if there is a horizon."""
+    limit = int(scenario.params.max_slots)
+    if file.slot >= limit:
+        raise ValueError(f"slot is {file.slot}; episodes end after params.max_slots = {limit} slots; give less")
+    if scenario.params.end != "horizon":
+        return
+    horizon = float(scenario.params.horizon_s)
+    if file.elapsed_s >= horizon:
+        raise ValueError(f"elapsed_s is {file.elapsed_s:g}; the horizon is {horizon:g} s; give less")
+    if file.slot > 0 and "elapsed_s" not in file.model_fields_set:
+        raise ValueError(f"elapsed_s is missing, but slot is {file.slot}; give the seconds that these slots took")
 
 
 def _check_devices(
