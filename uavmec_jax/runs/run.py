@@ -33,7 +33,6 @@ from uavmec_jax.runs.signals import StopSignal
 from uavmec_jax.studies.results import Results
 from uavmec_jax.studies.schema import Study
 from uavmec_jax.studies.shard_result import ShardResult
-from uavmec_jax.studies.study import study_toml
 from uavmec_jax.training.machine import probe_node
 from uavmec_jax.training.population import Progress
 
@@ -175,15 +174,9 @@ def run_or_resume(
     ray: RayOptions | str | bool | None = None,
     on_progress: OnProgress = lambda _: None,
 ) -> Results:
-    """Run a study in a folder; if it holds a run of it, resume that, or load its results if it is complete.
-
-    Raises:
-        StudyError: as :func:`run_study`; or the folder holds a run of another study.
-    """
+    """Run a study in a folder; if it holds a run, resume that, or load its results if it is complete."""
     with reached(directory) as path:
         started = (path / RUN_PLAN).exists()
-        if started and study_toml(RunFolder.open(path).study) != study_toml(study):
-            raise StudyError(f"{path}: holds a run of another study, perhaps of earlier settings; move it away")
     if started:
         return resume_run(directory, ray=ray, on_progress=on_progress)
     return run_study(study, directory, command=command, ray=ray, on_progress=on_progress)

@@ -4,10 +4,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 from uavmec_jax.cluster.options import RayOptions
+from uavmec_jax.errors import StudyError
+from uavmec_jax.runs.file_names import RUN_PLAN
+from uavmec_jax.runs.folder import RunFolder
 from uavmec_jax.runs.run import run_or_resume
 from uavmec_jax.search.search import SearchResult, best_study
 from uavmec_jax.studies.compare import Side
-from uavmec_jax.studies.study import load_study
+from uavmec_jax.studies.schema import Study
+from uavmec_jax.studies.study import load_study, study_toml
 from uavmec_jax.training.population import Progress
 
 BASELINE, BEST = "baseline", "best"
@@ -36,7 +40,7 @@ def confirm(
 
     Raises:
         KeyboardInterrupt: a signal arrived; the runs can be resumed.
-        StudyError: a run is not possible, see :func:`uavmec_jax.runs.run.run_study`.
+        StudyError: a run is not possible, see :func:`uavmec_jax.runs.run.run_study`; or there is one of other settings.
     """
     space = result.space
     baseline = load_study(space.study, space.change | {"axes.seeds": space.confirm_seeds})
@@ -48,8 +52,19 @@ def confirm(
         def report(progress: Progress, name: str = name) -> None:
             on_progress(name, progress)
 
+        _check_study(Path(directory) / name, study)
         results = run_or_resume(study, Path(directory) / name, command=command, ray=ray, on_progress=report)
         if not results.run["complete"]:
             raise KeyboardInterrupt
         sides.append(Side(results))
     return sides[0], sides[1]
+
+
+def _check_study(path: Path, study: Study) -> None:
+    """Check that a run that is there already, perhaps of a shorter search, is one of this study.
+
+    Raises:
+        StudyError: it is not.
+    """
+    if (path / RUN_PLAN).exists() and study_toml(RunFolder.open(path).study) != study_toml(study):
+        raise StudyError(f"{path}: holds a run of another study, perhaps of earlier settings; move it away")
