@@ -13,12 +13,12 @@ from tests.populations import differs, make_agent, over_agents, stack, take
 from uavmec_jax.agents import dqn, episode, state_replay
 from uavmec_jax.agents.algorithm import Agent
 from uavmec_jax.agents.dqn import DQNHyper, DQNSpec
+from uavmec_jax.env.drawn_rollouts import priced_lifetimes
 from uavmec_jax.env.dynamics import initial_state
 from uavmec_jax.env.generator import ScenarioDistribution
 from uavmec_jax.env.padding import pad_layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rewards import make_reward
-from uavmec_jax.env.rollout import priced_lifetimes
 from uavmec_jax.env.scenario import Scenario
 
 N = 6

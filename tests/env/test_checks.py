@@ -7,13 +7,14 @@ import pytest
 
 import uavmec_jax as um
 from tests.env.small_fleets import ORIGIN, fleet_layout
-from uavmec_jax.env.checks import Bounds, check_bool, check_range, check_volumes
+from uavmec_jax.env.checks import Bounds, check_bool, check_range
 from uavmec_jax.env.fleet import make_depots, make_fleet
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.padding import pad_layout
 from uavmec_jax.env.rewards import make_reward
 from uavmec_jax.env.rollout import returns, rollout_from, trace, volume_table
 from uavmec_jax.env.scenario import Scenario
+from uavmec_jax.env.slot_checks import check_volumes
 from uavmec_jax.planning.heuristics import HEURISTICS
 
 KEY = jax.random.key(0)

@@ -7,12 +7,13 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from uavmec_jax.env import hardware
+from uavmec_jax.env.drawn_rollouts import rollout_draws
 from uavmec_jax.env.generator import ScenarioDistribution, sample_scenario, scenario_from_draw
 from uavmec_jax.env.layout import sample_layout
 from uavmec_jax.env.padding import pad_layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rewards import make_reward
-from uavmec_jax.env.rollout import returns, rollout, rollout_draws, rollouts
+from uavmec_jax.env.rollout import returns, rollout, rollouts
 from uavmec_jax.env.scenario import make_scenario
 from uavmec_jax.planning.heuristics import HEURISTICS
 

@@ -1,3 +1,4 @@
+from .drawn_rollouts import rollout_draws as rollout_draws
 from .dynamics import Cause as Cause
 from .dynamics import Outcome as Outcome
 from .dynamics import State as State
@@ -32,7 +33,6 @@ from .rollout import Episode as Episode
 from .rollout import Policy as Policy
 from .rollout import Trace as Trace
 from .rollout import returns as returns
-from .rollout import rollout_draws as rollout_draws
 from .rollout import rollout_from as rollout_from
 from .rollout import rollouts as rollouts
 from .rollout import tour_policy as tour_policy

@@ -29,7 +29,7 @@ MAX_LENGTH_M = 1e7
 """Largest coordinate, side of a region, altitude and signal range: beyond it, squares of distances lose their metres in
 float32. Northings of networks in UTM come up to it."""
 
-_WHOLE = 2**31
+_INTEGERS = 2**31
 """JAX's integers have 32 bits: where NumPy's are larger, it would drop the upper bits without a word."""
 
 _TINY = float(np.finfo(np.float32).tiny)  # in single precision, what is closer to 0 counts as 0,
@@ -66,17 +66,16 @@ class Bounds:
 
     @classmethod
     def of(cls, field: dataclasses.Field, largest: float | None = None) -> "Bounds":
-        """Return the bounds of a field of a dataclass: those in its metadata; if there are none, 0 or 1 or at least 0.
+        """Return the bounds of a field of a dataclass: those in its metadata, else at least 0, and at most 1 for a bool.
 
         Args:
             field: its default is a number, infinite if infinity is allowed.
             largest: upper limit where the metadata have none.
         """
         given = {name: field.metadata[name] for name in ("ge", "gt", "le", "lt") if name in field.metadata}
-        if isinstance(field.default, bool):
-            given = {"ge": 0, "le": 1}
+        usual = {"ge": 0, "le": 1} if isinstance(field.default, bool) else {"ge": 0}
         infinite = isinstance(field.default, float) and math.isinf(field.default)
-        return cls(**({"le": None if infinite else largest} | (given or {"ge": 0})), infinite=infinite)
+        return cls(**({"le": None if infinite else largest} | (given or usual)), infinite=infinite)
 
     def __str__(self) -> str:
         """Say what is allowed: ``a whole number from 0 to 11``."""
@@ -90,7 +89,7 @@ class Bounds:
 
     def admits(self, value: float) -> bool:
         """Return whether a number is in the range; one too small for single precision counts as 0."""
-        if isinstance(value, int) and not self.whole and not -_WHOLE <= value < _WHOLE:
+        if isinstance(value, int) and not self.whole and not -_INTEGERS <= value < _INTEGERS:
             return False
         value = 0 if -_TINY < value < _TINY else value
         return (
@@ -158,7 +157,8 @@ def check_pair(name: str, value: Any) -> None:
     Raises:
         ArgumentError: one line.
     """
-    if (len(value) if isinstance(value, tuple | list) else (*np.shape(value), 0)[0]) != 2:
+    numbers = (len(value),) if isinstance(value, tuple | list) else np.shape(value)[:1]
+    if numbers != (2,):
         raise ArgumentError(f"{name} is {value!r}; it should be two numbers")
 
 
@@ -183,57 +183,6 @@ def check_bool(name: str, value: Any) -> None:
     dtype = value.dtype if hasattr(value, "dtype") else np.asarray(value).dtype
     if dtype.kind != "b":
         raise ArgumentError(f"{name} has the dtype {dtype}; it should be bool")
-
-
-def check_action(action: Any, n_places: int, axes: tuple[str, ...] = ("UAV",)) -> None:
-    """Check an action, or a batch of them: places from 0, one per UAV. Quick where it is a single integer.
-
-    Raises:
-        ArgumentError: one line. A traced action passes, which :func:`transition` clamps; see :func:`debug_checks`.
-    """
-    number = action
-    if isinstance(action, np.ndarray | np.generic | jax.Array) and not isinstance(action, jax.core.Tracer):
-        array = np.asarray(action)
-        number = array.item() if array.size == 1 and array.dtype.kind in "iu" else None
-    if type(number) is int and 0 <= number < n_places:
-        return
-    check_ranges([action_check(action, n_places, axes)])
-
-
-def action_check(action: Any, n_places: int, axes: tuple[str, ...] = ("UAV",)) -> Check:
-    """Return the check of an action; that it holds integers is checked at once, since a dtype is never traced."""
-    dtype = getattr(action, "dtype", None)
-    if dtype is not None and dtype.kind not in "iu" and isinstance(action, jax.core.Tracer):
-        raise ArgumentError(f"action has the dtype {dtype}; it should be an integer")
-    return Check("action", action, Bounds(ge=0, le=n_places - 1, whole=True), axes)
-
-
-def volumes_check(volumes: Any) -> Check:
-    """Return the check of task volumes, bytes."""
-    return Check("volumes", volumes, Bounds(ge=0, le=LARGEST), ("device",))
-
-
-def check_volumes(volumes: Any, n_devices: int) -> None:
-    """Check task volumes ``[..., n]``, bytes.
-
-    Raises:
-        ArgumentError: one line. Of traced volumes, only the shape is checked; see :func:`debug_checks`.
-    """
-    check_shape("volumes", volumes, (n_devices,), "one per device")
-    check_ranges([volumes_check(volumes)])
-
-
-def check_volume_table(volumes: Any, n_devices: int, batch: tuple[int, ...] = ()) -> None:
-    """Check the task volumes of a number of slots, ``[*batch, H, n]``, bytes, of which there is at least one.
-
-    Raises:
-        ArgumentError: one line. Of traced volumes, only the shape is checked; see :func:`debug_checks`.
-    """
-    check_volumes(volumes, n_devices)
-    shape = tuple(np.shape(volumes))
-    if len(shape) != len(batch) + 2 or shape[:-2] != batch or shape[-2] == 0:
-        axes = ", ".join((*map(str, batch), "slots", str(n_devices)))
-        raise ArgumentError(f"volumes has shape {shape}; it should be ({axes}), with one slot or more")
 
 
 @contextmanager

@@ -11,13 +11,14 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
-from uavmec_jax.env.checks import action_check, check_ranges, volumes_check
+from uavmec_jax.env.checks import check_ranges
 from uavmec_jax.env.depots import can_help, serve_landed, stands_at
 from uavmec_jax.env.fleet import Fleet
 from uavmec_jax.env.layout import Layout, fleet_of
 from uavmec_jax.env.params import Params, check_params
 from uavmec_jax.env.scenario_checks import check_scenario
 from uavmec_jax.env.slot import Flights, Services, plan_flights, services_of, who_starts
+from uavmec_jax.env.slot_checks import action_check, volumes_check
 from uavmec_jax.env.state_checks import state_checks
 from uavmec_jax.env.types import Scalar
 from uavmec_jax.errors import ArgumentError

@@ -9,13 +9,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
-from uavmec_jax.env.checks import check_action, settled
+from uavmec_jax.env.checks import settled
 from uavmec_jax.env.dynamics import Cause, State, fresh_state
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.observation import observe
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.scenario import Scenario, advance, auto_reset, draw_volumes, is_truncated, make_scenario
 from uavmec_jax.env.scenario_checks import check_scenario
+from uavmec_jax.env.slot_checks import check_action
 
 
 def _checks_scenario(reset: Callable) -> Callable:

@@ -1,5 +1,6 @@
 """Distributions of scenarios: each draw has other devices, hardware and traffic."""
 
+import dataclasses
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -9,7 +10,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, Num, PRNGKeyArray
 
 from uavmec_jax.env import hardware
-from uavmec_jax.env.checks import LARGEST, MAX_LENGTH_M, Bounds, Check, check_ranges, check_rising
+from uavmec_jax.env.checks import LARGEST, MAX_LENGTH_M, SMALLEST, Bounds, Check, check_ranges, check_rising
 from uavmec_jax.env.layout import Layout, Traffic, make_layout
 from uavmec_jax.env.padding import mask_absent
 from uavmec_jax.env.params import MAX_DEVICES, Params, check_params
@@ -65,24 +66,14 @@ class ScenarioDistribution:
     traffic_weights: tuple[float, ...] | Float[Array, "*batch m"] = (0.0,)
 
 
-_FACTOR = Bounds(ge=1e-6, le=1e6)
+_AT_LEAST = Bounds(ge=0, le=LARGEST)
 _BOUNDS = {
     **{name: Bounds(ge=0, le=1) for name in ("typical", "powered", "connected", "traffic", "traffic_weights")},
     **{name: Bounds(ge=0, le=MAX_DEVICES) for name in ("typical_devices", "typical_least", "devices")},
-    **dict.fromkeys(("battery_factor", "hardware_factor", "uav_factor"), _FACTOR),
-    "region_m": Bounds(ge=1e-6, le=MAX_LENGTH_M),
-    "traffic_price": Bounds(ge=0, le=LARGEST),
+    **{name: Bounds(ge=1e-6, le=1e6) for name in ("battery_factor", "hardware_factor", "uav_factor")},
+    "region_m": Bounds(ge=SMALLEST, le=MAX_LENGTH_M),
 }
-_RISING = (
-    "devices",
-    "powered",
-    "connected",
-    "region_m",
-    "battery_factor",
-    "hardware_factor",
-    "uav_factor",
-    "traffic_price",
-)
+_RISING = [field.name for field in dataclasses.fields(ScenarioDistribution) if field.type == Range]
 
 
 def check_distribution(distribution: ScenarioDistribution, name: str = "distribution") -> None:
@@ -94,9 +85,10 @@ def check_distribution(distribution: ScenarioDistribution, name: str = "distribu
     check_params(distribution.params, f"{name}.params")
     check_ranges(
         [
-            Check(f"{name}.{field}", leaf, bounds, ("value",))
-            for field, bounds in _BOUNDS.items()
-            for leaf in jax.tree.leaves(getattr(distribution, field))  # one end of a range may be traced
+            Check(f"{name}.{field.name}", leaf, _BOUNDS.get(field.name, _AT_LEAST), ("value",))
+            for field in dataclasses.fields(distribution)
+            if field.name not in ("params", "reward")
+            for leaf in jax.tree.leaves(getattr(distribution, field.name))  # one end of a range may be traced
         ]
     )
     for field in _RISING:

@@ -122,8 +122,7 @@ def check_params(params: Params, name: str = "params") -> None:
         if type(value) is float and bounds.admits(value):  # most of them; the rest takes longer
             continue
         if isinstance(value, tuple | list):  # (low, high)
-            if len(value) != 2:
-                raise ArgumentError(f"{name}.{field} is {value!r}; it should be two numbers")
+            check_pair(f"{name}.{field}", value)
             checks += [Check(f"{name}.{field} (value {k})", number, bounds) for k, number in enumerate(value, 1)]
         else:
             checks.append(Check(f"{name}.{field}", value, bounds))

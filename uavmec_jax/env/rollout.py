@@ -10,7 +10,6 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key, PRNGKeyArray
 
 from uavmec_jax.env.checks import check_range
 from uavmec_jax.env.dynamics import Cause, Outcome, State, complete_state, initial_state, service, transition
-from uavmec_jax.env.generator import ScenarioDistribution, scenario_from_draw
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import MAX_DEVICES, Params, check_params
 from uavmec_jax.env.rewards import check_reward
@@ -48,19 +47,6 @@ class Episode:
     first_failure: Float[Array, "*batch n"]
     lasted: Scalar = 1.0
     service_s: Float[Array, "*batch"] | None = None
-
-
-def check_policy(policy: object) -> None:
-    """Check that a policy is a function, and not the name of one.
-
-    Raises:
-        ArgumentError: one line.
-    """
-    if not callable(policy):
-        raise ArgumentError(
-            f"policy is {policy!r}; it should be a function such as um.planning.HEURISTICS['oldest-first'] or "
-            "um.load_policy('generalist')"
-        )
 
 
 def slot_volumes(params: Params, n_devices: int, key: PRNGKeyArray, slot: Int[ArrayLike, ""]) -> Float[Array, " n"]:
@@ -103,7 +89,6 @@ def rollout_from(policy: Policy, params: Params, layout: Layout, state: State, k
     Raises:
         ArgumentError: as in :func:`rollout`, and for the state.
     """
-    check_policy(policy)
     check_scenario(params, layout)
     check_state(layout, state)
     return _play(policy, params, layout, state, key, slots=0)[1]
@@ -187,6 +172,7 @@ def _make_act_and_volumes(
     policy: Policy, params: Params, layout: Layout, key: PRNGKeyArray
 ) -> tuple[Callable[[State], Array], Callable[[State], Array]]:
     """Return the functions of the state that give an episode's action and task volumes ``[n]``, both drawn from ``key``."""
+    _check_policy(policy)
     policy_key = jax.random.fold_in(key, _POLICY_STREAM)
 
     def act(state: State) -> Array:
@@ -196,6 +182,19 @@ def _make_act_and_volumes(
         return slot_volumes(params, layout.n_devices, key, state.slot)
 
     return act, volumes
+
+
+def _check_policy(policy: Policy) -> None:
+    """Check that a policy is a function, and not the name of one.
+
+    Raises:
+        ArgumentError: one line.
+    """
+    if not callable(policy):
+        raise ArgumentError(
+            f"policy is {policy!r}; it should be a function such as um.planning.HEURISTICS['oldest-first'] or "
+            "um.load_policy('generalist')"
+        )
 
 
 def _initial_outcome(n: int) -> Outcome:
@@ -292,37 +291,3 @@ def tour_policy(actions: Int[Array, "H *K"]) -> Policy:
     Where the tour has come to its end (-1) and the network lives on, the UAVs fly to device 0.
     """
     return lambda params, layout, state, key=None: jnp.maximum(actions[state.slot], 0)
-
-
-def rollout_draws(policy: Policy, scenario: Scenario | ScenarioDistribution, keys: Key[Array, " D"]) -> Episode:
-    """Play one episode per key; the result's leaves are ``[D, ...]``.
-
-    Args:
-        policy: chooses each UAV's place in each slot.
-        scenario: a scenario, or a distribution from which every key draws its own scenario.
-        keys: draw the task volumes, and the scenarios if there is a distribution.
-
-    Raises:
-        ArgumentError: a value of the scenario or the distribution is out of range, or there are no keys; one line.
-    """
-    check_range("the number of keys", len(keys), ge=1, whole=True)
-    if isinstance(scenario, Scenario):
-        check_reward(scenario.reward)
-        return rollouts(policy, scenario.params, scenario.layout, keys)
-    return jax.vmap(lambda key: _rollout_draw(policy, scenario, key)[1])(keys)
-
-
-def priced_lifetimes(policy: Policy, distribution: ScenarioDistribution, keys: Key[Array, " D"]) -> Float[Array, " D"]:
-    """Return each episode's lifetime in slots, less the price of its first failure; every key draws its own scenario."""
-
-    def priced_lifetime(key: PRNGKeyArray) -> Float[Array, ""]:
-        layout, episode = _rollout_draw(policy, distribution, key)
-        return episode.length.astype(jnp.float32) - jnp.sum(episode.first_failure * layout.failure_price(0.0))
-
-    return jax.vmap(priced_lifetime)(keys)
-
-
-def _rollout_draw(policy: Policy, distribution: ScenarioDistribution, key: PRNGKeyArray) -> tuple[Layout, Episode]:
-    """Draw a scenario, play an episode in it, and return its layout and the episode."""
-    scenario = scenario_from_draw(distribution, key)
-    return scenario.layout, rollout(policy, scenario.params, scenario.layout, key)

@@ -52,9 +52,6 @@ def check_state(layout: Layout, state: Any, name: str = "state") -> None:
         ("age", (n,), "one per device"),
         ("uav_energy", (uavs,), "one per UAV"),
         ("uav_position", (uavs, 2), "x and y of each UAV"),
-    ):
-        check_shape(f"{name}.{field}", getattr(state, field), shape, what)
-    for field, shape, what in (
         ("grounded", (uavs,), "one per UAV"),
         ("failed_at", (n,), "one per device"),
         ("packs", (depots,), "one per depot"),

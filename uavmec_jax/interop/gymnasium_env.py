@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
-from uavmec_jax.env.checks import check_action
 from uavmec_jax.env.dynamics import Cause, State, initial_state
 from uavmec_jax.env.layout import check_one_uav
 from uavmec_jax.env.observation import observe
 from uavmec_jax.env.scenario import Scenario, advance, draw_volumes, is_truncated, make_scenario
+from uavmec_jax.env.slot_checks import check_action
 
 
 def make_spaces(scenario: Scenario) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Discrete]:

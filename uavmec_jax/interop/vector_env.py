@@ -12,13 +12,14 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from uavmec_jax.env.checks import check_action, check_range
+from uavmec_jax.env.checks import check_range
 from uavmec_jax.env.dynamics import Cause, State
 from uavmec_jax.env.environment import UavMecEnv
 from uavmec_jax.env.layout import sample_layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.scenario import Scenario, make_scenario
 from uavmec_jax.env.scenario_checks import check_scenario
+from uavmec_jax.env.slot_checks import check_action
 from uavmec_jax.interop.gymnasium_env import make_spaces
 
 _CAUSES = np.array([cause.name.lower() for cause in Cause])

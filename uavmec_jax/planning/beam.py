@@ -25,11 +25,12 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Int, Num
 
-from uavmec_jax.env.checks import check_range, check_volume_table
+from uavmec_jax.env.checks import check_range
 from uavmec_jax.env.dynamics import Cause, Outcome, State, initial_state, transition
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.scenario_checks import check_scenario
+from uavmec_jax.env.slot_checks import check_volume_table
 from uavmec_jax.planning.beam_score import Problem, ValueFn, dominated, make_problem, score
 from uavmec_jax.planning.fleet_deadlines import earliest_deadline
 from uavmec_jax.planning.fleet_demand import counting_bound

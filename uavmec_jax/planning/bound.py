@@ -39,10 +39,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, Num
 
-from uavmec_jax.env.checks import check_range, check_volume_table
+from uavmec_jax.env.checks import check_range
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.scenario_checks import check_scenario
+from uavmec_jax.env.slot_checks import check_volume_table
 from uavmec_jax.planning.bound_instance import Instance, instances
 from uavmec_jax.planning.device_rows import add_age_rows, add_battery_rows
 from uavmec_jax.planning.energy_rows import add_depot_rows, add_endurance_rows, endurance

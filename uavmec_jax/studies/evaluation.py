@@ -13,8 +13,9 @@ import pandas as pd
 from jaxtyping import Array, Bool, Int, Key
 
 from uavmec_jax.agents.algorithm import Agent, Algorithm
+from uavmec_jax.env.drawn_rollouts import rollout_draws
 from uavmec_jax.env.generator import ScenarioDistribution
-from uavmec_jax.env.rollout import Episode, rollout_draws
+from uavmec_jax.env.rollout import Episode
 from uavmec_jax.planning.parallel import heuristic_episodes
 from uavmec_jax.studies.evaluation_result import EvaluationResult, PlannerResult
 from uavmec_jax.studies.planner_evaluation import evaluate_planners, flatten_draws, planner_columns

@@ -14,8 +14,9 @@ from jaxtyping import Array, Float, Int, Key
 
 from uavmec_jax.agents.algorithm import AGENTS_AXIS, Agent, Algorithm, AlgorithmState
 from uavmec_jax.agents.networks import Weights
+from uavmec_jax.env.drawn_rollouts import priced_lifetimes
 from uavmec_jax.env.generator import ScenarioDistribution
-from uavmec_jax.env.rollout import Policy, priced_lifetimes, returns, rollouts
+from uavmec_jax.env.rollout import Policy, returns, rollouts
 from uavmec_jax.env.scenario import Scenario
 
 
