@@ -32,6 +32,7 @@ with search_folder("s", load_space("space.toml")):
 def begun(space, tmp_path):  # noqa: F811
     """The folder of a search whose first trial is proposed."""
     with search_folder(tmp_path / "s", space) as path, opened_trials(path, space) as trials:
+        trials.enqueue_trial({"learning_rate": 0.01, "hidden": "[8]", "reward.M": 0.5})  # what `other_choices` replaces
         trial = trials.ask()
         trial.suggest_float("learning_rate", 1e-4, 1e-1, log=True)
         trial.suggest_categorical("hidden", ["[8]", "[16, 16]"])
