@@ -71,6 +71,17 @@ def test_every_transition_is_stored_exactly(jit, n_devices, capacity, stride, ma
     assert_array_equal(batch.discount, np.float32(GAMMA))
 
 
+def test_the_rows_of_many_agents_lie_in_memory_as_the_array_says():
+    """On a GPU, XLA would choose another order for the loop and keep a second copy of all buffers for it."""
+    spec = ReplaySpec(n_devices=12, capacity=100)
+    shape = (5, spec.ring + 1, spec.words)
+    arrays = (jnp.zeros(shape, jnp.uint32), jnp.int32(0), jnp.zeros((5, spec.stride, spec.words), jnp.uint32))
+    add = jax.jit(jax.vmap(functools.partial(replay.add, spec), (0, None, 0)))
+    line = next(line for line in add.lower(*arrays).as_text().splitlines() if "@LayoutConstraint" in line)
+    assert "result_layouts = [dense<[2, 1, 0]> : tensor<3xindex>]" in line
+    assert line.endswith(f"tensor<{'x'.join(map(str, shape))}xui32>")
+
+
 def test_sampling_is_uniform_and_with_replacement():
     spec = ReplaySpec(n_devices=2, capacity=50, stride=1, wraps=True)
     buffer_state, _ = filled(spec, 70)

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental.layout import Layout, with_layout_constraint
 from jaxtyping import Array, Bool, Float, Int, UInt
 
 from uavmec_jax.env.types import Scalar
@@ -26,6 +27,9 @@ TERMINATED = 1 << _ACTION_BITS
 """Flag in a row's last word: the episode terminated."""
 ENDED = 2 << _ACTION_BITS
 """Flag in a row's last word: the episode terminated or was truncated."""
+_ROW_BY_ROW = Layout((0, 1))
+"""How the rows lie in memory: in order, those of each agent together. XLA would choose another order for a loop on a GPU, and
+copy all buffers, transposed, at its beginning and end."""
 
 
 class Transition(NamedTuple):
@@ -193,7 +197,7 @@ def add(
     if spec.wraps:  # row 0 is what row 1 follows: once the ring is full, a copy of the ring's last row
         first = jnp.where(position + spec.stride == spec.ring, new_rows[-1], buffer_state[0])
         buffer_state = jax.lax.dynamic_update_slice(buffer_state, first[None], (0, 0))
-    return buffer_state
+    return with_layout_constraint(buffer_state, _ROW_BY_ROW)
 
 
 def sample(
