@@ -1,7 +1,10 @@
 """Hyperparameter search: spaces, successive halving, and searches that are stopped."""
 
 import json
+import sqlite3
+from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +13,7 @@ from tests.runs.processes import TINY
 from uavmec_jax.errors import StudyError
 from uavmec_jax.reporting.search import history_figure, importance_figure, search_json, search_tables
 from uavmec_jax.search.confirm import confirm
+from uavmec_jax.search.folder import DATABASE
 from uavmec_jax.search.halving import SuccessiveHalving
 from uavmec_jax.search.search import run_search
 from uavmec_jax.search.space import load_space, study_changes
@@ -17,6 +21,7 @@ from uavmec_jax.studies.compare import overall, pair
 from uavmec_jax.studies.study import load_study
 from uavmec_jax.training.training import Trainer
 
+ROOT = Path(__file__).parents[2]
 SPACE = """
 study = "tiny.toml"
 trials = 8
@@ -45,6 +50,16 @@ def space(tmp_path, monkeypatch):
     return load_space("space.toml")
 
 
+def states(folder):
+    """How many trials in the database of a search are in which state."""
+    with closing(sqlite3.connect(folder / DATABASE)) as connection:
+        return dict(connection.execute("SELECT state, COUNT(*) FROM trials GROUP BY state").fetchall())
+
+
+def test_all_trials_of_the_committed_search_have_ended():
+    assert states(ROOT / "results" / "search") == {"COMPLETE": 12, "PRUNED": 36, "FAIL": 16}
+
+
 @pytest.mark.slow
 def test_a_stopped_search_continues_to_the_same_result(space, tmp_path):
     whole = run_search(space, tmp_path / "whole", command="x")
@@ -68,6 +83,17 @@ def test_a_stopped_search_continues_to_the_same_result(space, tmp_path):
     assert best.a2c.learning_rate == whole.best["learning_rate"]
     assert best.reward == {"U": 1.0, "M": whole.best["reward.M"]}
     assert best.axes["seeds"] == 2  # the reported seeds, not those of the validation scenarios
+
+    # a search that is to have fewer trials after a stop gives up those that were proposed; they can be proposed again
+    with pytest.raises(KeyboardInterrupt):
+        run_search(space, tmp_path / "fewer", command="x", on_progress=stop)
+    fewer = run_search(space.model_copy(update={"trials": 4}), tmp_path / "fewer", command="x")
+    assert fewer.trials.equals(trials[:4])
+    assert states(tmp_path / "fewer") == {"COMPLETE": 2, "PRUNED": 2, "FAIL": 4}
+    rest = run_search(space, tmp_path / "fewer", command="x").trials
+    assert rest["number"].tolist() == [0, 1, 2, 3, 8, 9, 10, 11]
+    assert rest.drop(columns="number").equals(trials.drop(columns="number"))
+    assert states(tmp_path / "fewer") == {"COMPLETE": 4, "PRUNED": 4, "FAIL": 4}
 
     more = run_search(space.model_copy(update={"trials": 9}), tmp_path / "whole", command="x")
     assert more.trials[:8].equals(trials)

@@ -152,6 +152,9 @@ def _run_batches(
         for trial, outcome in zip(members, outcomes, strict=True):
             if not trial.state.is_finished():
                 _record(optuna, trials, trial, outcome)
+    for trial in trials.get_trials(deepcopy=False):  # proposed before a stop, when the search was to have more trials
+        if not trial.state.is_finished():
+            trials.tell(trial.number, state=optuna.trial.TrialState.FAIL)
 
 
 def best_study(result: SearchResult) -> Study:
@@ -177,7 +180,7 @@ def _propose_batch(optuna: Any, trials: "optuna.Study", space: Space, batch: int
     """
     names, combinations, baseline = static_settings(space), static_combinations(space), baseline_settings(space)
     size = min(space.batch, space.trials - batch * space.batch)
-    members = [trial for trial in trials.get_trials(deepcopy=False) if trial.user_attrs.get(BATCH) == batch]
+    members = [trial for trial in _proposed(trials) if trial.user_attrs.get(BATCH) == batch]
     while len(members) < size:
         number = batch * space.batch + len(members)
         sampler = optuna.samplers.TPESampler(
@@ -198,7 +201,12 @@ def _propose_batch(optuna: Any, trials: "optuna.Study", space: Space, batch: int
             _suggest(trial, key, values, baseline[key])
         trial.set_user_attr(BATCH, batch)
         members.append(trials.get_trials(deepcopy=False)[trial.number])
-    return sorted(members, key=lambda trial: trial.number)
+    return sorted(members, key=lambda trial: trial.number)[:size]
+
+
+def _proposed(trials: "optuna.Study") -> list[Any]:
+    """Return the trials without those that were given up."""
+    return [trial for trial in trials.get_trials(deepcopy=False) if trial.state.name != "FAIL"]
 
 
 def _suggest(trial: Any, key: str, values: Range | Choices, baseline: Any) -> None:
@@ -241,7 +249,7 @@ def _best_value(trials: "optuna.Study") -> float:
 def _search_result(optuna: Any, trials: "optuna.Study", space: Space) -> SearchResult:
     """Build the result from the database."""
     rows = []
-    for trial in trials.get_trials(deepcopy=False)[: space.trials]:
+    for trial in _proposed(trials)[: space.trials]:
         if trial.state.is_finished():
             row = {"number": trial.number, "batch": trial.user_attrs[BATCH], "state": trial.state.name.lower()}
             row |= {"value": trial.value, "steps": max(trial.intermediate_values, default=0)}
