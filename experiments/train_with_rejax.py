@@ -1,6 +1,6 @@
 """An algorithm of another library on this environment: PPO of rejax, through the five-value adapter.
 
-    uv run --group rejax python experiments/train_with_rejax.py --out results/rejax
+    uv run --no-default-groups --group rejax python experiments/train_with_rejax.py --out results/rejax
 
 Trains on one layout with 8 powered and 8 connected devices and prints the greedy policy's lifetime beside oldest-first's.
 rejax (https://github.com/keraJLi/rejax) expects the step of gymnax 0.0.9, which FiveValueEnv has.

@@ -1,17 +1,21 @@
 """README, docs and the READMEs of the results: their code runs, their commands parse, their links and names exist.
 
-A code block after the HTML comment ``<!-- full -->`` takes long: it runs with the marker ``full`` only.
+A code block after the HTML comment ``<!-- full -->`` takes long: it runs with the marker ``full`` only. One after
+``<!-- client: gymnax -->`` needs that library: it runs where the library is (``tests/clients``).
 """
 
 import ast
 import re
 import shlex
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
 import click
 import pytest
+import yaml
 
+import uavmec_jax as um
 from uavmec_jax.agents.registry import ALGORITHMS
 from uavmec_jax.cli import main
 from uavmec_jax.planning.heuristics import HEURISTICS
@@ -30,12 +34,13 @@ FOLDERS = ("uavmec_jax", "tests", "experiments", "docs", "results", ".ci")
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block: its language, its text, the number of its first line, and whether it takes long."""
+    """A fenced block: its language, its text, the number of its first line, whether it takes long, and its client."""
 
     language: str
     text: str
     line: int
     full: bool
+    client: str | None
 
 
 def read(page):
@@ -44,9 +49,11 @@ def read(page):
 
 def blocks(page, language):
     found = []
-    for fence in re.finditer(r"^(<!-- full -->\n)?```(\w+)\n(.*?)^```$", read(page), re.MULTILINE | re.DOTALL):
-        line = read(page)[: fence.start(3)].count("\n") + 1
-        found.append(Block(fence[2], fence[3], line, fence[1] is not None))
+    comment = r"(?:<!-- (?:(full)|client: (\w+)) -->\n)?"
+    for fence in re.finditer(rf"^{comment}```(\w+)\n(.*?)^```$", read(page), re.MULTILINE | re.DOTALL):
+        full, client, written_in, text = fence.groups()
+        line = read(page)[: fence.start(4)].count("\n") + 1
+        found.append(Block(written_in, text, line, full is not None, client))
     return [block for block in found if block.language == language]
 
 
@@ -85,15 +92,20 @@ def mark(page):
     return pytest.param(page, marks=() if page == "README.md" else pytest.mark.slow)
 
 
-@pytest.mark.parametrize("page", [mark(page) for page in PAGES if not all(b.full for b in blocks(page, "python"))])
+def ours(page):
+    """The page's code that needs no client."""
+    return [block for block in blocks(page, "python") if block.client is None]
+
+
+@pytest.mark.parametrize("page", [mark(page) for page in PAGES if not all(block.full for block in ours(page))])
 def test_code_runs(page, tmp_path, monkeypatch):
-    execute(page, [block for block in blocks(page, "python") if not block.full], tmp_path, monkeypatch)
+    execute(page, [block for block in ours(page) if not block.full], tmp_path, monkeypatch)
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("page", [page for page in PAGES if any(block.full for block in blocks(page, "python"))])
+@pytest.mark.parametrize("page", [page for page in PAGES if any(block.full for block in ours(page))])
 def test_all_code_runs(page, tmp_path, monkeypatch):
-    execute(page, blocks(page, "python"), tmp_path, monkeypatch)
+    execute(page, ours(page), tmp_path, monkeypatch)
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "sh")])
@@ -103,7 +115,11 @@ def test_commands_parse(page):
             parse(words[words.index("uavmec") + 1 :])
         for word in words:
             if word.startswith("experiments/"):
-                options = {option.split("=")[0] for option in words if option.startswith("--")} - {"--group", "--extra"}
+                options = {option.split("=")[0] for option in words if option.startswith("--")} - {
+                    "--group",
+                    "--no-default-groups",
+                    "--extra",
+                }
                 source = read(word)
                 assert [option for option in options if f'"{option}"' not in source] == [], words
 
@@ -200,3 +216,16 @@ def test_readme_is_short_and_ci_runs_its_test_command():
     assert len(read("README.md").splitlines()) < 100
     command = next(block.text for block in blocks("README.md", "sh") if "pytest" in block.text).splitlines()[-1]
     assert command in read(".ci/run")
+
+
+def test_the_citation_is_of_this_version():
+    facts = yaml.safe_load(read("CITATION.cff"))
+    project = tomllib.loads(read("pyproject.toml"))["project"]
+    assert (
+        (facts["version"], facts["license"])
+        == (project["version"], project["license"])
+        == (um.__version__, "Apache-2.0")
+    )
+    assert facts["keywords"] == project["keywords"]
+    for form in ROOT.glob(".github/ISSUE_TEMPLATE/*.yml"):
+        assert {"name", "description", "body"} == set(yaml.safe_load(form.read_text()))

@@ -25,7 +25,7 @@ ORDER = (
 
 INSIDE_FUNCTIONS = {
     "interop.gymnasium_env": ("uavmec_jax.reporting.map_figure",),  # matplotlib, for those who render
-    "interop.five_values": ("gymnax.environments",),  # the caller's library
+    "env.gymnax_spaces": ("gymnax.environments",),  # the caller's library
     "cluster.local": ("ray",),  # of the extra `ray`
     "cluster.worker": ("ray",),  # of the extra `ray`
     "search.folder": ("sqlalchemy", "sqlalchemy.exc"),  # of the extra `search`

@@ -2,7 +2,7 @@
 
 ``import uavmec_jax as um`` is immediate: jax is imported when a name is first used. ``__init__.pyi`` lists the names; the
 rooms ``um.env``, ``um.planning``, ``um.agents``, ``um.training``, ``um.scenarios``, ``um.studies``, ``um.runs``,
-``um.search`` and ``um.traffic`` have more.
+``um.search``, ``um.traffic`` and ``um.interop`` have more.
 """
 
 import lazy_loader

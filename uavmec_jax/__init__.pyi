@@ -1,5 +1,6 @@
 from . import agents as agents
 from . import env as env
+from . import interop as interop
 from . import planning as planning
 from . import runs as runs
 from . import scenarios as scenarios

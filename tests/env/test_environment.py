@@ -36,8 +36,6 @@ def test_first_observation_is_ones_then_zeros():
     assert_allclose(observation, [1.0] * 12 + [0.0] * 12, rtol=2e-7)  # a GPU divides to the last bit but one
     assert observation.dtype == jnp.float32
     assert state.slot == 0
-    assert ENV.num_actions(ENV.default_params) == 12
-    assert ENV.observation_shape(ENV.default_params) == (24,)
 
 
 @both_modes
@@ -228,7 +226,6 @@ def test_another_observation_fn():
     """With the full observation the environment plays the same slots and also returns the final observation."""
     scenario = make_scenario()
     plain, full = UavMecEnv(), UavMecEnv(observation_fn=observe_devices)
-    assert full.observation_shape(scenario).features == (12, len(FEATURES))
     observation, state = full.reset(jax.random.key(0), scenario)
     _, same = plain.reset(jax.random.key(0), scenario)
     for number in range(12):  # visiting one device over and over: the data of the others expire

@@ -7,7 +7,6 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from tests.env.small_fleets import ORIGIN, PARAMS, fleet_layout
-from uavmec_jax.env.environment import UavMecEnv
 from uavmec_jax.env.fleet import make_depots, make_fleet
 from uavmec_jax.env.layout import check_one_uav
 from uavmec_jax.env.scenario import make_scenario
@@ -58,7 +57,7 @@ def test_bad_values_are_named(make, line):
 
 
 def test_actions_are_places():
-    assert UavMecEnv().num_actions(make_scenario(fleet_layout(2, make_depots(TWO_DEPOTS)), PARAMS)) == 5
+    assert make_scenario(fleet_layout(2, make_depots(TWO_DEPOTS)), PARAMS).layout.n_places == 5
 
 
 @pytest.mark.parametrize(

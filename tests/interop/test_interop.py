@@ -1,5 +1,7 @@
 """The environment through the interfaces of other libraries."""
 
+import sys
+
 import chex
 import gymnasium
 import jax
@@ -142,6 +144,23 @@ def test_five_values():
     assert done
     assert info["discount"] == 0.0
     assert state.slot == 0
+
+
+def test_five_values_hold_scalars_which_such_libraries_average():
+    env = FiveValueEnv()
+    _, state = env.reset(jax.random.key(0))
+    *_, info = env.step(jax.random.key(1), state, 0)
+    assert sorted(info) == ["cause", "discount", "duration", "length", "terminated", "truncated"]
+    assert {jnp.shape(value) for value in info.values()} == {()}
+    assert env.num_actions == um.UavMecEnv().num_actions == 12
+
+
+def test_a_missing_gymnax_is_one_line(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gymnax.environments", None)
+    for env in (um.UavMecEnv(), FiveValueEnv()):
+        for space in (env.action_space, env.observation_space):
+            with pytest.raises(um.UserError, match=r"^gymnax is not installed \(.*\); install it: pip install gymnax$"):
+                space()
 
 
 def test_fleets_are_refused_and_ages_have_no_limit_until_a_horizon():

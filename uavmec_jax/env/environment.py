@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
+from uavmec_jax.env import gymnax_spaces
 from uavmec_jax.env.checks import settled
 from uavmec_jax.env.dynamics import Cause, State, fresh_state
 from uavmec_jax.env.layout import Layout
@@ -42,9 +43,11 @@ def _checks_action(step: Callable) -> Callable:
     return checked
 
 
-@dataclass(frozen=True)
+@dataclass(
+    unsafe_hash=True
+)  # not frozen: gymnax's wrapper for Gymnasium's vector environments replaces methods of a copy
 class UavMecEnv:
-    """UAV-assisted edge computing with the signatures of gymnax 1.0.
+    """UAV-assisted edge computing with the signatures of gymnax 1.0; its wrappers run on it.
 
     - Observation: f32 ``[2n]``, see :func:`observe`.
     - Action: int32, a place for each UAV: a device in ``[0, n)`` or a depot in ``[n, n + D)``; shape ``[K]``, or ``[]`` if
@@ -68,15 +71,31 @@ class UavMecEnv:
         """The scenario used if none is given: :func:`make_scenario` without arguments."""
         return make_scenario()
 
-    def num_actions(self, params: Scenario) -> int:
-        """Return the number of places that each UAV can fly to, devices and depots."""
-        return params.layout.n_places
+    @property
+    def num_actions(self) -> int:
+        """Number of places that a UAV can fly to in :attr:`default_params`; ``action_space(params).n`` is that of others."""
+        return Params.n_devices
 
-    def observation_shape(self, params: Scenario) -> Any:
-        """Return the shape of an observation, or, if it is a pytree, the tree of its leaves' shapes."""
-        state = jax.eval_shape(fresh_state, params.params, params.layout)
-        return jax.tree.map(
-            lambda leaf: leaf.shape, jax.eval_shape(self.observation_fn, params.params, params.layout, state)
+    def action_space(self, params: Scenario | None = None) -> Any:
+        """Return gymnax's ``Discrete`` of the places that a UAV can fly to, devices and depots; for a fleet, a ``Tuple``.
+
+        Raises:
+            UserError: gymnax is not installed.
+        """
+        return gymnax_spaces.action_space((self.default_params if params is None else params).layout)
+
+    def observation_space(self, params: Scenario | None = None) -> Any:
+        """Return gymnax's ``Box`` of the paper's observation ``[2n]``; of another ``observation_fn``, a space without bounds.
+
+        Raises:
+            UserError: gymnax is not installed.
+        """
+        scenario = self.default_params if params is None else params
+        if self.observation_fn is observe:
+            return gymnax_spaces.paper_observation_space(scenario.params, scenario.layout)
+        state = jax.eval_shape(fresh_state, scenario.params, scenario.layout)
+        return gymnax_spaces.unbounded_space(
+            jax.eval_shape(self.observation_fn, scenario.params, scenario.layout, state)
         )
 
     @_checks_scenario
@@ -95,7 +114,11 @@ class UavMecEnv:
     @_checks_action
     @partial(jax.jit, static_argnames=("self",))
     def step(
-        self, key: PRNGKeyArray, state: State, action: Int[ArrayLike, ""], params: Scenario | None = None
+        self,
+        key: PRNGKeyArray,
+        state: State,
+        action: Int[ArrayLike, ""] | Int[Array, " K"],
+        params: Scenario | None = None,
     ) -> tuple[Any, State, Float[Array, ""], Bool[Array, ""], Bool[Array, ""], dict[str, Any]]:
         """Play one slot with volumes drawn from ``key``.
 

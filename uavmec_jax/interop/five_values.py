@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Num, PRNGKeyArray
 
@@ -28,7 +27,8 @@ class FiveValueParams:
 class FiveValueEnv:
     """:class:`UavMecEnv` with ``step`` returning ``(observation, state, reward, done, info)``.
 
-    Truncation counts as done; ``info["discount"]`` is 0 where the episode terminated.
+    Truncation counts as done. ``info`` holds scalars alone, since such libraries average whatever is in it: ``discount``,
+    which is 0 where the episode terminated, ``terminated``, ``truncated``, ``cause``, ``duration`` (s) and ``length``.
     """
 
     name = "UavMec"
@@ -56,19 +56,29 @@ class FiveValueEnv:
         """
         scenario = (params or self.default_params).scenario
         observation, state, reward, terminated, truncated, info = self._env.step(key, state, action, scenario)
-        return observation, state, reward, terminated | truncated, info | {"discount": 1.0 - terminated}
+        scalars = {name: info[name] for name in ("terminated", "truncated", "cause", "duration", "length")}
+        return observation, state, reward, terminated | truncated, scalars | {"discount": 1.0 - terminated}
 
-    def observation_space(self, params: FiveValueParams) -> Any:
-        """Return gymnax's ``Box`` from 0 to the data age limit + 1."""
-        from gymnax.environments import spaces  # not a dependency: only clients of gymnax call this
+    @property
+    def num_actions(self) -> int:
+        """As :attr:`um.UavMecEnv.num_actions`."""
+        return self._env.num_actions
 
-        max_age = params.scenario.params.data_age_limit_slots + 1.0
-        return spaces.Box(0.0, max_age, self._env.observation_shape(params.scenario), jnp.float32)
+    def observation_space(self, params: FiveValueParams | None = None) -> Any:
+        """Return gymnax's ``Box`` of the observation ``[2n]``.
+
+        Raises:
+            UserError: gymnax is not installed.
+        """
+        return self._env.observation_space((params or self.default_params).scenario)
 
     def action_space(self, params: FiveValueParams | None = None) -> Any:
-        """Return gymnax's ``Discrete``: the device to visit."""
-        from gymnax.environments import spaces
+        """Return gymnax's ``Discrete``: the device to visit.
 
+        Raises:
+            ValueError: the layout has several UAVs or depots.
+            UserError: gymnax is not installed.
+        """
         scenario = (params or self.default_params).scenario
         check_one_uav(scenario.layout, "this interface")
-        return spaces.Discrete(self._env.num_actions(scenario))
+        return self._env.action_space(scenario)

@@ -1,6 +1,7 @@
 """Many scenarios as one Gymnasium vector environment: every step is one jitted call."""
 
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import chex
@@ -15,12 +16,11 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from uavmec_jax.env.checks import check_range
 from uavmec_jax.env.dynamics import Cause, State
 from uavmec_jax.env.environment import UavMecEnv
-from uavmec_jax.env.layout import sample_layout
-from uavmec_jax.env.params import Params
-from uavmec_jax.env.scenario import Scenario, make_scenario
+from uavmec_jax.env.rewards import Reward
+from uavmec_jax.env.scenario import Scenario
 from uavmec_jax.env.scenario_checks import check_scenario
 from uavmec_jax.env.slot_checks import check_action
-from uavmec_jax.interop.gymnasium_env import make_spaces
+from uavmec_jax.interop.options import choose_scenario, choose_spaces
 
 _CAUSES = np.array([cause.name.lower() for cause in Cause])
 
@@ -35,42 +35,58 @@ class UavMecVectorEnv(VectorEnv):
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
-    def __init__(self, num_envs: int = 1, scenario: Scenario | None = None) -> None:
-        """Bind scenarios.
+    def __init__(
+        self,
+        num_envs: int = 1,
+        scenario: Scenario | str | Path | None = None,
+        *,
+        observation: str = "paper",
+        reward: str | Reward | None = None,
+        powered: int | None = None,
+        connected: int | None = None,
+        layout_seed: int | None = None,
+    ) -> None:
+        """Make the scenarios.
 
         Args:
             num_envs: ``N``.
-            scenario: one for all environments, or one each (leaves ``[N, ...]``); by default random layouts with 8 powered
-                and 8 connected devices, drawn with the keys 0 to N - 1.
+            scenario: a scenario or a scenario file for all environments, or one scenario each (leaves ``[N, ...]``); by
+                default random layouts of the paper's twelve devices, all different.
+            observation: ``"paper"`` or ``"full"``, as in :class:`UavMecGymEnv`.
+            reward: a name of Table 6, or what :func:`um.make_reward` returns; by default that of the scenario.
+            powered: number of devices with power in the random layouts; by default 8.
+            connected: number of devices with communication in the random layouts; by default 8.
+            layout_seed: seed of the first random layout, the others follow; by default 0.
 
         Raises:
-            ValueError: the batch of scenarios has another size, or a value is out of range.
+            ValueError: the batch of scenarios has another size, or an option or a value is out of range.
         """
         check_range("num_envs", num_envs, ge=1, whole=True)
         self.num_envs = num_envs
-        self._scenarios = _batch(num_envs, scenario)
+        chosen = choose_scenario(scenario, powered, connected, layout_seed, reward, batch=num_envs)
+        self._scenarios = _batch(num_envs, chosen)
         check_scenario(self._scenarios.params, self._scenarios.layout)
-        self.single_observation_space, self.single_action_space = make_spaces(self._scenarios)
+        self.single_observation_space, self.single_action_space, observe = choose_spaces(self._scenarios, observation)
         self.observation_space: gymnasium.Space = batch_space(self.single_observation_space, num_envs)
         self.action_space: gymnasium.Space = batch_space(self.single_action_space, num_envs)
-        self._env = UavMecEnv()
+        self._env = UavMecEnv(observation_fn=observe)
         self._state: State | None = None
         self._key, self._steps = jax.random.key(0), 0
 
     def reset(
         self, *, seed: int | None = None, options: dict | None = None
-    ) -> tuple[Float[np.ndarray, "N two_n"], dict[str, Any]]:
+    ) -> tuple[Float[np.ndarray, "N obs_size"], dict[str, Any]]:
         """Start an episode in every environment; ``seed`` seeds the task volumes of all."""
         super().reset(seed=seed, options=options)
         if seed is not None or self._state is None:
             self._key, self._steps = jax.random.key(int(self.np_random.integers(2**32, dtype=np.uint32))), 0
         observation, self._state = _reset(self._env, self._scenarios)
-        return np.asarray(observation), {}
+        return np.array(observation), {}
 
     def step(
         self, actions: Any
     ) -> tuple[
-        Float[np.ndarray, "N two_n"],
+        Float[np.ndarray, "N obs_size"],
         Float[np.ndarray, " N"],
         Bool[np.ndarray, " N"],
         Bool[np.ndarray, " N"],
@@ -87,7 +103,10 @@ class UavMecVectorEnv(VectorEnv):
             self._env, self._scenarios, self._key, np.uint32(self._steps), self._state, actions
         )
         self._steps += 1
-        observation, (reward, terminated, truncated, info) = jax.device_get((observation, results))
+        # Copies, since JAX's arrays cannot be written: what is returned is the caller's own.
+        observation, (reward, terminated, truncated, info) = jax.tree.map(
+            np.array, jax.device_get((observation, results))
+        )
         final_observation = info.pop("final_observation")
         ended = info.pop("terminated") | info.pop("truncated")
         info["cause"] = _CAUSES[info["cause"]]
@@ -101,12 +120,8 @@ class UavMecVectorEnv(VectorEnv):
         return observation, reward, terminated, truncated, info
 
 
-def _batch(num_envs: int, scenario: Scenario | None) -> Scenario:
+def _batch(num_envs: int, scenario: Scenario) -> Scenario:
     """Return ``num_envs`` scenarios, leaves ``[num_envs, ...]``."""
-    if scenario is None:
-        params = Params()
-        keys = jax.vmap(jax.random.key)(jnp.arange(num_envs))
-        return jax.vmap(lambda key: make_scenario(sample_layout(key, params, 8, 8), params))(keys)
     if scenario.layout.capacity.ndim == 1:
         return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num_envs, *jnp.shape(leaf))), scenario)
     if scenario.layout.capacity.shape[0] != num_envs:
@@ -115,7 +130,7 @@ def _batch(num_envs: int, scenario: Scenario | None) -> Scenario:
 
 
 @partial(jax.jit, static_argnums=0)
-def _reset(env: UavMecEnv, scenarios: Scenario) -> tuple[Float[Array, "N two_n"], State]:
+def _reset(env: UavMecEnv, scenarios: Scenario) -> tuple[Float[Array, "N obs_size"], State]:
     return jax.vmap(lambda scenario: env.reset(jax.random.key(0), scenario))(scenarios)
 
 
