@@ -62,6 +62,22 @@ def ppo_policy():
     return TrainedPolicy.of(collection_of("ppo", ppo.PPOSpec(hidden=(16,)).network, settings, agents), "ppo", 2, "best")
 
 
+def test_a_policy_that_is_loaded_again_is_the_same_one(run, tmp_path):
+    """So its programs are compiled once, however often it is loaded, and wherever from."""
+    chosen = {"powered": 4, "connected": 12, "seed": 1}
+    policy = load_policy(run, **chosen)
+    assert load_policy(run, **chosen) is load_policy(run / "weights.npz", **chosen) is policy
+    policy.save(tmp_path / "alone.npz")
+    assert load_policy(tmp_path / "alone.npz") is policy
+    assert load_policy(run, powered=4, connected=12, seed=0) is not policy
+    assert load_policy("rollout") is load_policy("rollout")
+    other = dict(policy.collection.weights)
+    name = next(iter(other))
+    other[name] = other[name] + np.float32(1)
+    write_policies(tmp_path / "alone.npz", replace(policy.collection, weights=other))
+    assert load_policy(tmp_path / "alone.npz") is not policy
+
+
 @pytest.mark.slow
 def test_policy_of_a_run_has_the_lifetime_in_its_table(tmp_path):
     results = run_study(parse_study(TINY, "tiny"), tmp_path / "run")

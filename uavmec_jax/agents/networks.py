@@ -1,11 +1,15 @@
 """Networks: small dense stacks, initialised as Stable-Baselines3 does."""
 
 import math
+from collections.abc import Mapping
+from functools import lru_cache
+from types import MappingProxyType
 from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from flax import traverse_util
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from uavmec_jax.env.products import product
@@ -208,8 +212,15 @@ class ActorCritic(nn.Module):
 
 def count_weights(network: nn.Module, obs_size: int) -> int:
     """Count the weights of a network without allocating them."""
+    return sum(math.prod(shape) for shape in weight_shapes(network, obs_size).values())
+
+
+@lru_cache(maxsize=64)
+def weight_shapes(network: nn.Module, obs_size: int) -> Mapping[str, tuple[int, ...]]:
+    """Return the shapes of a network's weights by name, ``params/Dense_0/kernel``; nothing is allocated."""
     weights: Weights = jax.eval_shape(network.init, jax.random.key(0), jnp.zeros((1, obs_size)))
-    return sum(leaf.size for leaf in jax.tree.leaves(weights))
+    leaves = traverse_util.flatten_dict(weights, sep="/")
+    return MappingProxyType({name: leaf.shape for name, leaf in leaves.items()})
 
 
 def scale_ages(observation: Float[Array, "*b two_n"], age_scale: Scalar) -> Float[Array, "*b two_n"]:

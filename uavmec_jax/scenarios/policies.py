@@ -1,10 +1,13 @@
 """Load policies by name or from files: heuristics, planners and trained agents."""
 
+import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import lru_cache, partial
 from importlib import resources
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -72,24 +75,9 @@ class TrainedPolicy:
         Raises:
             PolicyError: there are no such weights, or they are not finite.
         """
-        weights = jax.tree.map(lambda leaf: jnp.asarray(leaf[index]), collection.weights_of(which, name))
-        if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(weights)):
+        if not all(np.isfinite(leaf[index]).all() for leaf in jax.tree.leaves(collection.weights_of(which, name))):
             raise PolicyError(f"the {which} weights of {name} are not finite: training diverged")
-        alone = select_agent(collection, name, index, which)
-        axes = alone.agents[name][0]
-        algorithm, hyper = alone.algorithm(name), alone.hyper(name, axes)
-        value_fn = None
-        if (network_value := algorithm.value_fn) is not None:
-            value_fn = jax.jit(lambda *state: network_value(hyper, weights, algorithm.observation_fn(*state)))
-        return cls(
-            algorithm=name,
-            trained_on=axes,
-            n_devices=None if observes_devices(alone.settings[name]) else alone.n_devices,
-            collection=alone,
-            _policy=jax.jit(algorithm.policy(hyper, weights)),
-            _greedy=jax.jit(partial(algorithm.greedy, hyper, weights)),
-            _value_fn=value_fn,
-        )
+        return _compiled(_Agent(select_agent(collection, name, index, which), name, which))
 
     def __call__(self, params: Params, layout: Layout, state: State, key: Any = None) -> Int[Array, "*batch"]:
         """Return the device to visit, int32; the state may have any number of batch axes in front.
@@ -186,6 +174,45 @@ class TrainedPolicy:
             write_policies(file, self.collection)
 
 
+class _Agent:
+    """The collection of one agent; two with the same contents are equal."""
+
+    def __init__(self, collection: PolicyCollection, name: str, which: str) -> None:
+        self.collection, self.name, self.which = collection, name, which
+        facts = {key: getattr(collection, key) for key in ("settings", "n_devices", "agents", "drawn")}
+        digest = hashlib.sha256(json.dumps([name, which, facts], sort_keys=True, default=str).encode())
+        for key, leaf in sorted(collection.weights.items()):
+            digest.update(f"{key} {leaf.dtype} {leaf.shape}".encode() + leaf.tobytes())
+        self._digest = digest.hexdigest()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Agent) and self._digest == other._digest
+
+    def __hash__(self) -> int:
+        return hash(self._digest)
+
+
+@lru_cache(maxsize=16)
+def _compiled(agent: _Agent) -> TrainedPolicy:
+    """Return the policy of an agent. One that is loaded again is the same object, whose programs are compiled already."""
+    alone, name = agent.collection, agent.name
+    weights = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), alone.weights_of(agent.which, name))
+    axes = alone.agents[name][0]
+    algorithm, hyper = alone.algorithm(name), alone.hyper(name, axes)
+    value_fn = None
+    if (network_value := algorithm.value_fn) is not None:
+        value_fn = jax.jit(lambda *state: network_value(hyper, weights, algorithm.observation_fn(*state)))
+    return TrainedPolicy(
+        algorithm=name,
+        trained_on=MappingProxyType(axes),
+        n_devices=None if observes_devices(alone.settings[name]) else alone.n_devices,
+        collection=alone,
+        _policy=jax.jit(algorithm.policy(hyper, weights)),
+        _greedy=jax.jit(partial(algorithm.greedy, hyper, weights)),
+        _value_fn=value_fn,
+    )
+
+
 def load_policy(source: str | Path, which: str = "best", **axes: Any) -> Policy:
     """Load a policy by name, from a file, or of one agent of a run.
 
@@ -197,7 +224,8 @@ def load_policy(source: str | Path, which: str = "best", **axes: Any) -> Policy:
             which all agents have the same value may be left out.
 
     Returns:
-        ``policy(params, layout, state, key=None) -> action``; a :class:`TrainedPolicy` if it was trained.
+        ``policy(params, layout, state, key=None) -> action``; a :class:`TrainedPolicy` if it was trained. Loaded again, it is
+        the same object as before, and nothing is compiled again; the last 16 are kept.
 
     Raises:
         PolicyError: there is no such policy; its file is damaged, altered or from another version; its weights are not
@@ -206,7 +234,7 @@ def load_policy(source: str | Path, which: str = "best", **axes: Any) -> Policy:
     if str(source) in FLEET_HEURISTICS:
         return FLEET_HEURISTICS[str(source)]
     if str(source) == "rollout":
-        return rollout_planner()
+        return _rollout()
     shipped = {Path(file.name).stem: file for file in _SHIPPED.iterdir() if file.name.endswith(".npz")}
     location = Path(str(shipped[str(source)])) if str(source) in shipped else source
     with reached(location, PolicyError) as path:
@@ -220,6 +248,11 @@ def load_policy(source: str | Path, which: str = "best", **axes: Any) -> Policy:
         return TrainedPolicy.of(collection, name, index, which)
     except PolicyError as error:
         raise PolicyError(f"{path}: {error}") from None
+
+
+@lru_cache(maxsize=1)
+def _rollout() -> Policy:
+    return rollout_planner()
 
 
 def _weights_file(path: Path, names: Sequence[str]) -> Path:

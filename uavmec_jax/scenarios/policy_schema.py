@@ -4,12 +4,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from flax import traverse_util
 from pydantic import Field, model_validator
 
+from uavmec_jax.agents.networks import weight_shapes
 from uavmec_jax.agents.registry import ALGORITHMS
 from uavmec_jax.agents.settings import SETTINGS
 from uavmec_jax.env.params import MAX_DEVICES
@@ -131,5 +129,4 @@ def check_weights(path: Path, weights: Mapping[str, np.ndarray], shapes: Mapping
 
 def network_shapes(spec: Any, agents: int) -> dict[str, tuple[int, ...]]:
     """Return the shapes of the weights of agents with the same static settings, by name; nothing is allocated."""
-    weights: Any = jax.eval_shape(spec.network.init, jax.random.key(0), jnp.zeros((1, spec.obs_size)))
-    return {key: (agents, *leaf.shape) for key, leaf in traverse_util.flatten_dict(weights, sep="/").items()}
+    return {name: (agents, *shape) for name, shape in weight_shapes(spec.network, spec.obs_size).items()}
