@@ -117,7 +117,7 @@ def print_tables(console: Any, tables: dict[str, Any], lines: list[str], directo
     """Print tables with their titles, lines below them, and the folder of the files."""
     for title, table in tables.items():
         console.print(title, style="bold")
-        console.print(table)
+        console.print_table(table)
     for line in lines:
         console.print(line, highlight=False)
     if directory is not None:

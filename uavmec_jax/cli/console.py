@@ -3,9 +3,11 @@
 from typing import Any
 
 from rich.console import Console
+from rich.table import Table
 from rich.text import Text
 
 from uavmec_jax.errors import printable
+from uavmec_jax.reporting.fitting import fitted
 
 
 class PlainConsole(Console):
@@ -14,6 +16,11 @@ class PlainConsole(Console):
     def render_str(self, text: str, **options: Any) -> Text:
         """Make a renderable of text; characters that a terminal would obey, or cannot show, are escaped."""
         return super().render_str(printable(text, keep="\n"), **options)
+
+    def print_table(self, table: Table) -> None:
+        """Print a table so that it fits: names wrap first, then columns go below; no number is cut."""
+        for part in fitted(table, self):
+            self.print(part)
 
     def print_heading(self, name: str, text: str, *, soft_wrap: bool = False) -> None:
         """Print a line that begins with a name in bold type."""

@@ -108,7 +108,7 @@ def evaluate(
     console = new_console()
     measured = "Share of the horizon in service" if "service" in rows[0] else "Lifetime"
     console.print(f"{measured} over {draws} volume draws ± 95 %", style="bold")
-    console.print(evaluation_table(rows))
+    console.print_table(evaluation_table(rows))
     if trained is not None:
         for line in _training_lines(trained, named, scenario):
             console.print(line, highlight=False)

@@ -172,7 +172,7 @@ def _print(evacuation: Any, source: str, as_json: bool) -> None:
         return
     console = new_console()
     console.print_heading(evacuation.name, evacuation.meta["description"])
-    console.print(evacuation_table(evacuation))
+    console.print_table(evacuation_table(evacuation))
     for line in evacuation_lines(evacuation):
         console.print(line, highlight=False)
     console.print(f"File: {source}", highlight=False, soft_wrap=True)

@@ -155,7 +155,7 @@ def _lifetime(cell: Any, policy: str, baselines: list[str], with_paper: bool) ->
     text.append(half_interval(cell[f"{policy}_low"], cell[f"{policy}_high"]), style="dim")
     compared = [f"{paper:g}" if paper is not None else "-"] * with_paper
     compared += map(mean, baselines)
-    separator = "\n" if f"{policy}_censored" in cell else " / "  # signs take room
+    separator = "\n" if f"{policy}_censored" in cell else "/"  # signs take room
     return text.append(f"\n{separator.join(compared)}" if compared else "", style="not bold default")
 
 
