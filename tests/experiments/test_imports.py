@@ -6,8 +6,11 @@ import pytest
 
 from tests.experiments.scripts import EXPERIMENTS
 
-OF_OTHER_GROUPS = ("parity_purejaxql", "parity_sb3", "parity_training_sb3", "sb3_quality", "train_with_rejax")
-"""Scripts that compare with packages outside the test run."""
+OF_OTHER_GROUPS = (
+    *("gymnax_client", "parity_purejaxql", "parity_sb3", "parity_training_sb3", "sb3_quality", "train_with_rejax"),
+    "vec_env_speed",
+)
+"""Scripts for packages outside the test run."""
 
 
 @pytest.mark.parametrize("script", sorted({file.stem for file in EXPERIMENTS.glob("*.py")} - set(OF_OTHER_GROUPS)))

@@ -5,9 +5,12 @@ from pathlib import Path
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Num, PRNGKeyArray
-from matplotlib.animation import PillowWriter
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from PIL import Image
 
 from uavmec_jax.env.layout import Layout, fleet_of
 from uavmec_jax.env.params import Params
@@ -15,13 +18,22 @@ from uavmec_jax.env.rollout import Policy, Trace, trace
 from uavmec_jax.files.writing import atomic
 from uavmec_jax.reporting.canvas import literal, new_figure
 from uavmec_jax.reporting.map_figure import uav_colour
-from uavmec_jax.reporting.road_map import density_legend, draw_roads, draw_sites, set_limits
+from uavmec_jax.reporting.road_map import COLOURS, density_legend, draw_roads, draw_sites, set_limits
 from uavmec_jax.traffic.evacuation import Evacuation
 
 _MAX_SLOTS = 120
 """Longest episode that is drawn."""
 
-_FRAMES_PER_S = 2
+_LEGEND = "roads: vehicles/km/lane; cross: UAV, with its tour; dotted: the limit of ages"
+
+_FRAME_MS, _LAST_FRAME_MS = 500, 2500
+"""How long frames are shown; the last one longer, before the animation repeats."""
+
+_HAS, _LACKS, _FAILED = "#D0D0D0", "#0072B2", "#D55E00"
+"""Colours of the bars of devices that have a resource, that lack it, and that failed."""
+
+_HATCH = "///"
+"""What also marks the bars of devices that failed."""
 
 
 def save_animation(
@@ -40,16 +52,32 @@ def save_animation(
     """
     episode = jax.tree.map(np.asarray, jax.jit(lambda: trace(policy, params, layout, key, _MAX_SLOTS))())
     slots = int(episode.played.sum())
-    figure = new_figure(9.6, 6.2)
-    writer = PillowWriter(fps=_FRAMES_PER_S)
-    with atomic(path) as partial, writer.saving(figure, str(partial), dpi=80):
-        for slot in range(slots):
-            figure.clear()
-            _draw_slot(figure, evacuation, params, layout, episode, slot, title)
-            writer.grab_frame()
-        for _ in range(2 * _FRAMES_PER_S):  # hold the last frame before the animation repeats
-            writer.grab_frame()
+    figure, palette, frames = new_figure(9.6, 6.6), _palette(layout.n_uavs), []
+    figure.set_dpi(80)
+    for slot in range(slots):
+        figure.clear()
+        _draw_slot(figure, evacuation, params, layout, episode, slot, title)
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        pixels = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+        frames.append(pixels.quantize(palette=palette, dither=Image.Dither.NONE))
+    durations = [_FRAME_MS] * (slots - 1) + [_LAST_FRAME_MS]
+    with atomic(path) as partial:
+        frames[0].save(
+            partial, "GIF", save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=False
+        )
     return slots
+
+
+def _palette(n_uavs: int) -> Image.Image:
+    """Return the palette of all frames: the colours that are drawn, and what is between them and white at smooth edges."""
+    drawn = [*COLOURS, _HAS, _LACKS, _FAILED, *map(uav_colour, range(min(n_uavs, 8)))]
+    shares = np.linspace(0.0, 1.0, 9)[:-1]  # of white
+    mixed = [share + (1 - share) * np.array(to_rgb(colour)) for colour in drawn for share in shares]
+    greys = [np.full(3, level) for level in np.linspace(0.0, 1.0, 256 - len(mixed))]
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(np.round(255 * np.array(mixed + greys)).astype(np.uint8).tobytes())
+    return palette
 
 
 def _draw_slot(
@@ -71,6 +99,16 @@ def _draw_slot(
     _draw_bars(axes[1], battery, np.asarray(layout.has_power), failed, "battery", 1.0)
     _draw_bars(axes[2], np.asarray(now.state.age), np.asarray(layout.has_comms), failed, "age, slots", age_limit + 1)
     axes[2].axvline(age_limit, color="black", lw=0.8, ls=":")
+    bars = [Patch(color=_LACKS, label="lacks power, or communication"), Patch(color=_HAS, label="has it")]
+    bars.append(Patch(facecolor=_FAILED, hatch=_HATCH, label="failed first"))
+    figure.legend(
+        handles=[*density_legend(), *bars],
+        loc="outside lower center",
+        ncols=6,
+        fontsize=7,
+        title=_LEGEND,
+        title_fontsize=7,
+    )
 
 
 def _draw_traffic(axis: Axes, evacuation: Evacuation, stops: Float[np.ndarray, "stops K 2"], window: int) -> None:
@@ -84,7 +122,6 @@ def _draw_traffic(axis: Axes, evacuation: Evacuation, stops: Float[np.ndarray, "
         axis.plot(*tour.T, color=colour, lw=0.6, alpha=0.4, zorder=2)
         axis.plot(*tour[-2:].T, color=colour, lw=1.8, zorder=5)
         axis.plot(*tour[-1], marker="X", color=colour, ms=11, zorder=6)
-    axis.legend(handles=density_legend(), fontsize=6, loc="lower right", title="vehicles/km/lane", title_fontsize=6)
 
 
 def _draw_bars(
@@ -95,13 +132,13 @@ def _draw_bars(
     title: str,
     limit: float,
 ) -> None:
-    """Draw a bar per device: grey where the device has the resource and needs no visit, red where it failed first."""
+    """Draw a bar per device, in a colour for whether it has the resource, or failed first."""
     numbers = np.arange(1, len(value) + 1)
     colours = [
-        "tab:red" if share > 0 else "lightgrey" if has else "tab:blue"
-        for share, has in zip(failed, has_resource, strict=True)
+        _FAILED if share > 0 else _HAS if has else _LACKS for share, has in zip(failed, has_resource, strict=True)
     ]
-    axis.barh(numbers, value, color=colours)
+    for bar, share in zip(axis.barh(numbers, value, color=colours), failed, strict=True):
+        bar.set_hatch(_HATCH if share > 0 else "")
     axis.set_yticks(numbers)
     axis.set_ylim(len(value) + 0.6, 0.4)
     axis.set_xlim(0, limit)

@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from uavmec_jax.reporting.canvas import literal, new_figure
+from uavmec_jax.reporting.canvas import PALETTE, legend_beside, line_style, literal, new_figure
 from uavmec_jax.reporting.formatting import slots
 from uavmec_jax.reporting.heat_map import draw_heat_map, heat_map_figure
 from uavmec_jax.reporting.table6 import is_table6, label_rewards
@@ -129,12 +129,13 @@ def curves_figure(results: Results) -> Figure:
     for axis, steps, values, title in pairs:
         for k, (algorithm, curves) in enumerate(results.curves.items()):
             x, y = curves[steps], curves[values]
-            axis.plot(x, y.T, lw=0.6, alpha=0.35 if single else 0.15, color=f"C{2 * k}")
-            axis.plot(x, np.nanmean(y, axis=0), lw=2, color=f"C{2 * k + 1}", label=f"{algorithm.upper()}, mean")
+            axis.plot(x, y.T, lw=0.6, alpha=0.35 if single else 0.15, color=PALETTE[k % len(PALETTE)])
+            mean = line_style(k) | ({"color": "black"} if single else {})
+            axis.plot(x, np.nanmean(y, axis=0), lw=2, label=f"{algorithm.upper()}, mean", **mean)
         axis.set_xlabel("environment steps of one agent")
         axis.set_title(f"{title}: every agent, and their mean", fontsize=10)
         axis.grid(alpha=0.3)
-    right.legend()
+    legend_beside(right)
     left.set_ylabel("episode length, slots")
     figure.suptitle(f"{literal(results.study.name)}: {len(results.agents)} agents", fontsize=11)
     return figure

@@ -7,31 +7,37 @@ import numpy as np
 from jaxtyping import UInt8
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from uavmec_jax.env.dynamics import State
 from uavmec_jax.env.fleet import DepotKind
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.scenario import Scenario
+from uavmec_jax.reporting.canvas import legend_beside
 
 _RESOURCES = {
-    (True, True): ("tab:green", "has both"),
-    (True, False): ("tab:blue", "no comms"),
-    (False, True): ("tab:orange", "no power"),
-    (False, False): ("tab:red", "has neither"),
+    (True, True): ("#595959", "o", "has both"),
+    (True, False): ("#0072B2", "p", "no comms"),
+    (False, True): ("#C44E00", "D", "no power"),
+    (False, False): ("#6A1B7A", "^", "has neither"),
 }
-"""Power and communication of a device -> its colour, and the label of the colour."""
+"""Power and communication of a device -> its colour, its shape, and the label of both."""
+
+_AREA = {"o": 110, "p": 150, "D": 95, "^": 210}
+"""Areas with which the shapes have room for a number, points squared."""
 
 _MOST_ENERGIES = 5
 """UAVs whose energies are in the title."""
 
 
 def draw_devices(axis: Axes, layout: Layout) -> None:
-    """Draw numbered discs, with a colour and a legend entry for each combination of power and communication."""
-    for (power, comms), (colour, label) in _RESOURCES.items():
+    """Draw numbered shapes, one with a colour of its own for each combination of power and communication that there is."""
+    for (power, comms), (colour, shape, label) in _RESOURCES.items():
         chosen = (np.asarray(layout.has_power) == power) & (np.asarray(layout.has_comms) == comms)
         x, y = np.asarray(layout.position)[chosen].T
-        axis.scatter(x, y, s=90, color=colour, label=label, zorder=2)
+        if chosen.any():
+            axis.scatter(x, y, s=_AREA[shape], marker=shape, color=colour, label=label, zorder=2)
     for device, (x, y) in enumerate(np.asarray(layout.position)):
         axis.annotate(f"{device + 1}", (x, y), ha="center", va="center", fontsize=7, color="white", zorder=3)
     axis.set_aspect("equal", adjustable="datalim")
@@ -39,9 +45,9 @@ def draw_devices(axis: Axes, layout: Layout) -> None:
     axis.set_ylabel("m north")
 
 
-def uav_colour(uav: int) -> tuple[float, ...]:
+def uav_colour(uav: int) -> str:
     """Return the colour of a UAV; those of devices are others."""
-    return tuple(matplotlib.colormaps["Dark2"](uav % 8))
+    return to_hex(matplotlib.colormaps["Dark2"](uav % 8))
 
 
 def draw_depots(axis: Axes, layout: Layout) -> None:
@@ -84,7 +90,7 @@ def map_pixels(
     more = ", ..." * (layout.n_uavs > _MOST_ENERGIES)
     uavs = "UAV" if layout.n_uavs == 1 else "UAVs"
     axis.set_title(f"slot {int(state.slot)}, {uavs} {energies}{more} kJ", fontsize=10)
-    axis.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1, 1))
+    legend_beside(axis, markerscale=0.7)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 

@@ -1,20 +1,30 @@
-"""Road maps: roads coloured by traffic density in the paper's seven colours, devices numbered and sized by weight."""
+"""Road maps: roads coloured by traffic density in seven steps, devices numbered and sized by weight."""
 
+from typing import Any
+
+import matplotlib
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from uavmec_jax.reporting.canvas import literal, new_figure
+from uavmec_jax.reporting.canvas import legend_beside, literal, new_figure
 from uavmec_jax.traffic.evacuation import Evacuation
 
-COLOURS = ("blue", "cyan", "yellow", "green", "orange", "red", "magenta")
-"""Colours in order of increasing density (paper, figure 4)."""
+COLOURS = tuple(to_hex(matplotlib.colormaps["plasma_r"](share)) for share in np.linspace(0.1, 1.0, 7))
+"""Colours in order of increasing density, from light to dark: also in grey, and with any colour vision, denser is darker.
+
+The paper's figure 4 has seven colours, too, in the order of the rainbow.
+"""
 
 LIMITS = (2.0, 5.0, 10.0, 20.0, 35.0, 60.0)
 """Vehicles per km and lane between one colour and the next; the paper gives none."""
+
+_THIN, _THICK = 0.9, 2.4
+"""Widths of roads below the first limit, and of all others, points."""
 
 _MARGIN = 0.35
 """Margin of the map around the devices, as a share of the longer side of their bounding box."""
@@ -36,7 +46,7 @@ def draw_roads(axis: Axes, evacuation: Evacuation, density: Float[np.ndarray, " 
     corner = evacuation.position.min(axis=0)
     order = np.argsort(density)
     roads = evacuation.roads
-    widths = np.where(density[order] < LIMITS[0], 0.8, 2.2)
+    widths = np.where(density[order] < LIMITS[0], _THIN, _THICK)
     lines = LineCollection(
         [roads[k] - corner for k in order], colors=colours_of(density[order]), linewidths=widths, zorder=1
     )
@@ -65,10 +75,17 @@ def set_limits(axis: Axes, evacuation: Evacuation) -> None:
 
 
 def density_legend() -> list[Line2D]:
-    """Return the entries of a legend of the colours."""
+    """Return the entries of a legend of the roads and the devices."""
     edges = [0.0, *LIMITS]
     labels = [f"{low:g} to {high:g}" for low, high in zip(edges, LIMITS, strict=False)] + [f"above {LIMITS[-1]:g}"]
-    return [Line2D([], [], color=colour, lw=2.5, label=label) for colour, label in zip(COLOURS, labels, strict=True)]
+    widths = [_THIN, *[_THICK] * (len(COLOURS) - 1)]
+    roads = [
+        Line2D([], [], color=colour, lw=width, label=label)
+        for colour, width, label in zip(COLOURS, widths, labels, strict=True)
+    ]
+    device: Any = {"marker": "o", "mfc": "white", "mec": "black", "ls": ""}
+    little = Line2D([], [], ms=6, label="device, little traffic", **device)
+    return [*roads, little, Line2D([], [], ms=12, label="device, much traffic", **device)]
 
 
 def draw_map(axis: Axes, evacuation: Evacuation) -> None:
@@ -77,20 +94,13 @@ def draw_map(axis: Axes, evacuation: Evacuation) -> None:
     draw_sites(axis, evacuation)
     set_limits(axis, evacuation)
     first, last = evacuation.meta["mean_s"]
-    axis.legend(
-        handles=density_legend(),
-        fontsize=7,
-        loc="upper left",
-        bbox_to_anchor=(1, 1),
-        title="vehicles/km/lane",
-        title_fontsize=7,
-    )
+    legend_beside(axis, handles=density_legend(), title="vehicles/km/lane", title_fontsize=7)
     axis.set_title(f"{literal(evacuation.name)}: mean of {first / 60:.0f} to {last / 60:.0f} min", fontsize=10)
 
 
 def map_figure(evacuation: Evacuation) -> Figure:
     """Return the road map of an evacuation, with the description of the place below it."""
-    figure = new_figure(7.4, 6.4)
+    figure = new_figure(8.6, 6.4)
     draw_map(figure.subplots(), evacuation)
     figure.supxlabel(literal(evacuation.meta["description"]), fontsize=7)
     return figure

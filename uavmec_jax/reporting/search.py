@@ -8,7 +8,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from uavmec_jax.reporting.canvas import literal, new_figure
+from uavmec_jax.reporting.canvas import PALETTE, legend_beside, literal, new_figure
 from uavmec_jax.search.search import SearchResult
 from uavmec_jax.search.space import baseline_settings
 
@@ -47,11 +47,11 @@ def history_figure(result: SearchResult) -> Figure:
     trials, figure = result.trials, new_figure(7.0, 4.0)
     axis = figure.add_subplot()
     complete, pruned = trials[trials["state"] == "complete"], trials[trials["state"] == "pruned"]
-    axis.plot(pruned["number"], pruned["value"], "x", color="tab:gray", label="pruned, value at its last rung")
-    axis.plot(complete["number"], complete["value"], "o", color="tab:blue", label="complete")
-    axis.step(complete["number"], complete["value"].cummax(), where="post", color="tab:orange", label="best so far")
+    axis.plot(pruned["number"], pruned["value"], "x", color="#7F7F7F", label="pruned, value at its last rung")
+    axis.plot(complete["number"], complete["value"], "o", color=PALETTE[0], label="complete")
+    axis.step(complete["number"], complete["value"].cummax(), where="post", color=PALETTE[3], label="best so far")
     axis.set(xlabel="trial", ylabel="lifetime, slots", title=literal(result.space.name))
-    axis.legend(loc="lower right")
+    legend_beside(axis)
     axis.grid(alpha=0.3)
     return figure
 
@@ -64,7 +64,7 @@ def importance_figure(result: SearchResult) -> Figure:
     trials = result.trials
     for axis, setting in zip(axes, settings, strict=True):
         positions, labels = _positions(trials[setting])
-        colour = np.where(trials["state"] == "complete", "tab:blue", "lightgray")
+        colour = np.where(trials["state"] == "complete", PALETTE[0], "lightgray")
         axis.scatter(positions, trials["value"], c=colour, s=14)
         if labels is None and getattr(result.space.space[setting], "log", False):
             axis.set_xscale("log")

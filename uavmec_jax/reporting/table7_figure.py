@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from uavmec_jax.errors import TrafficError
-from uavmec_jax.reporting.canvas import literal, new_figure
+from uavmec_jax.reporting.canvas import PALETTE, legend_beside, literal, new_figure
 from uavmec_jax.reporting.road_map import draw_map
 from uavmec_jax.reporting.table7 import count_columns
 from uavmec_jax.studies.first_failures import first_failure_groups
@@ -46,7 +46,7 @@ def _draw_failures(axis: Axes, counts: pd.DataFrame, name: str) -> None:
     numbers = devices["device"].to_numpy()
     width = 0.8 / len(columns)
     for k, (policy, values) in enumerate(columns.items()):
-        colour = "black" if policy == "paper" else None
+        colour = "black" if policy == "paper" else PALETTE[k % len(PALETTE)]
         axis.bar(numbers + (k - (len(columns) - 1) / 2) * width, values, width, label=literal(policy), color=colour)
     for number in numbers[devices["high_traffic"].to_numpy()]:
         axis.axvspan(number - 0.5, number + 0.5, color="lightgrey", alpha=0.5, zorder=0, lw=0)
@@ -54,5 +54,5 @@ def _draw_failures(axis: Axes, counts: pd.DataFrame, name: str) -> None:
     axis.set_xlim(0.5, len(numbers) + 0.5)
     axis.set_xlabel("device; shaded: in high traffic")
     axis.set_ylabel("first failures")
-    axis.legend(fontsize=7)
+    legend_beside(axis)
     axis.set_title(f"{literal(name)}: first failures", fontsize=10)

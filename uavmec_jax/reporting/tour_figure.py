@@ -10,12 +10,15 @@ from matplotlib.figure import Figure
 from uavmec_jax.env.layout import fleet_of
 from uavmec_jax.env.rollout import Trace
 from uavmec_jax.planning.plan import Plan
-from uavmec_jax.reporting.canvas import literal, new_figure
+from uavmec_jax.reporting.canvas import legend_beside, line_style, literal, new_figure
 from uavmec_jax.reporting.map_figure import draw_depots, draw_devices, uav_colour
 from uavmec_jax.reporting.tours import targets, uav_stops
 from uavmec_jax.scenarios.named_scenario import NamedScenario
 
 _TITLES = {"rollout": "rollout planner", "beam": "beam (clairvoyant)"}
+
+_LEGEND_ROWS = 24
+"""Most rows in a legend beside a panel."""
 
 
 def tour_figure(plan: Plan, scenario: NamedScenario) -> Figure:
@@ -26,7 +29,7 @@ def tour_figure(plan: Plan, scenario: NamedScenario) -> Figure:
         scenario: it has the names and the region.
     """
     panels = 3 if plan.as_in_paper else 4
-    figure = new_figure(14 * panels / 3, 4.2 * len(plan.tours))
+    figure = new_figure(6 * panels, 4.2 * len(plan.tours))
     axes = figure.subplots(len(plan.tours), panels, squeeze=False)
     for row, (name, tour) in zip(axes, plan.tours.items(), strict=True):
         _draw_map(row[0], plan, scenario, tour, f"{_TITLES[name]}: {len(tour.action)} slots")
@@ -43,13 +46,7 @@ def _draw_devices_over_time(
     """Draw the battery of each device without power, and the data age of each device without communication."""
     slots = np.arange(len(tour.action) + 1)
     for device, label in enumerate(scenario.device_names):
-        colour = f"C{device % 10}"
-        style: Any = {
-            "color": colour,
-            "ls": "-" if device < 10 else "--",
-            "lw": 1.3,
-            "label": literal(f"{device + 1} {label}"),
-        }
+        style: Any = line_style(device) | {"lw": 1.3, "label": literal(f"{device + 1} {label}")}
         if not plan.layout.has_power[device]:
             fraction = tour.state.battery[:, device] / plan.layout.capacity[device]
             battery_axis.plot(slots, np.append(1.0, fraction), **style)
@@ -74,7 +71,7 @@ def _draw_map(axis: Axes, plan: Plan, scenario: NamedScenario, tour: Trace, titl
     """Draw region, depots and devices, the tour of each UAV, and the number of visits to each device."""
     layout = plan.layout
     if (corners := scenario.region_corners) is not None:
-        axis.plot(*np.concatenate([corners, corners[:1]]).T, color="0.7", lw=0.8, ls=":", zorder=0)
+        axis.plot(*np.concatenate([corners, corners[:1]]).T, color="0.7", lw=0.8, ls=":", zorder=0, label="region")
     for uav, name in enumerate(map(literal, scenario.uav_names)):
         stops = uav_stops(plan, tour, uav)
         alone = len(scenario.uav_names) == 1
@@ -91,8 +88,9 @@ def _draw_map(axis: Axes, plan: Plan, scenario: NamedScenario, tour: Trace, titl
     for device, (x, y) in enumerate(layout.position):
         visits = int(np.sum(targets(tour) == device))
         axis.annotate(f"{visits}x", (x, y), xytext=(7, 5), textcoords="offset points", fontsize=7)
+    axis.plot([], [], ls="", label="3x: visited three times")
     axis.set_title(title, fontsize=10)
-    axis.legend(fontsize=7, loc="best")
+    legend_beside(axis, markerscale=0.7)
 
 
 def _draw_starts(axis: Axes, starts: Float[np.ndarray, "K 2"]) -> None:
@@ -106,6 +104,7 @@ def _label(axis: Axes, quantity: str, title: str) -> None:
     axis.set_title(title, fontsize=10)
     axis.grid(alpha=0.3)
     if axis.has_data():
-        axis.legend(fontsize=6, ncols=2, loc="best")
+        lines = len(axis.get_legend_handles_labels()[0])
+        legend_beside(axis, fontsize=6, ncols=-(-lines // _LEGEND_ROWS))
     else:
         axis.text(0.5, 0.5, "none", ha="center", va="center", transform=axis.transAxes)
