@@ -31,20 +31,22 @@ def make(rows, columns):
     return table
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.data(), st.integers(1, 12), st.integers(1, 4), st.integers(30, 100))
 def test_no_number_is_cut_and_no_column_is_lost(data, columns, rows, width):
     drawn = [(data.draw(NAMES), *(data.draw(NUMBERS) for _ in range(columns))) for _ in range(rows)]
     text = printed(make(drawn, columns), width)
     assert "…" not in text
     assert max(map(len, text.splitlines())) <= width
-    cells = [cell.strip() for line in text.splitlines() for cell in re.split("[│┃]", line)]
+    lines = [[cell.strip() for cell in re.split("[│┃]", line)] for line in text.splitlines()]
+    cells = [cell for line in lines for cell in line]
+    names = "".join(
+        "".join(line[1].split()) for line in lines if len(line) > 1
+    )  # those that wrap go on in the next line
     for name, *numbers in drawn:
         for number in numbers:
             assert number in cells
-        letters = "".join(name.split())
-        joined = "".join("".join(cells).split())
-        assert all(part in joined for part in (letters[:3], letters[-3:]))
+        assert "".join(name.split()) in names
     assert str(columns - 1) in cells or any(cell.endswith(f" {columns - 1}") for cell in cells)
 
 
