@@ -1,7 +1,7 @@
 """README, docs and the READMEs of the results: their code runs, their commands parse, their links and names exist.
 
 A code block after the HTML comment ``<!-- full -->`` takes long: it runs with the marker ``full`` only. One after
-``<!-- client: gymnax -->`` needs that library: it runs where the library is (``tests/clients``).
+``<!-- client: gymnax -->`` needs that library: it runs where ``tests/clients/test_gymnax.py`` does.
 """
 
 import ast

@@ -1,4 +1,4 @@
-"""gymnax 1.0's own wrappers: uv run --no-default-groups --group gymnax pytest tests/clients -m clients."""
+"""gymnax 1.0's own wrappers: uv run --no-default-groups --group gymnax pytest tests/clients -m clients -W default."""
 
 import gymnasium
 import jax

@@ -1,4 +1,7 @@
-"""rejax, which expects the step of gymnax 0.0.9: uv run --no-default-groups --group rejax pytest tests/clients -m clients."""
+"""rejax, which expects the step of gymnax 0.0.9.
+
+uv run --no-default-groups --group rejax pytest tests/clients -m clients -W default
+"""
 
 import jax
 import numpy as np

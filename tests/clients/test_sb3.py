@@ -1,4 +1,4 @@
-"""Stable-Baselines3 on the batched environment: uv run --group sb3 pytest tests/clients -m clients."""
+"""Stable-Baselines3 on the batched environment: uv run --group sb3 pytest tests/clients -m clients -W default."""
 
 import numpy as np
 import pytest
