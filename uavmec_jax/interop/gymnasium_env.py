@@ -1,6 +1,7 @@
 """One scenario as a Gymnasium environment, for libraries that step one environment from Python."""
 
 import os
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -11,12 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
+from uavmec_jax.agents.observation_spec import OBSERVATIONS
 from uavmec_jax.env.dynamics import Cause, State, initial_state
 from uavmec_jax.env.rewards import Reward
 from uavmec_jax.env.scenario import Scenario, advance, draw_volumes, is_truncated
 from uavmec_jax.env.slot_checks import check_action
 from uavmec_jax.errors import UserError
-from uavmec_jax.interop.options import Observe, choose_scenario, choose_spaces
+from uavmec_jax.interop.options import choose_scenario, choose_spaces
 
 
 class UavMecGymEnv(gymnasium.Env):
@@ -64,14 +66,14 @@ class UavMecGymEnv(gymnasium.Env):
         self._check_process()
         self.scenario = choose_scenario(scenario, powered, connected, layout_seed, reward)
         self.render_mode, self.observation = render_mode, observation
-        self.observation_space, self.action_space, _ = choose_spaces(self.scenario, observation)
+        self.observation_space, self.action_space = choose_spaces(self.scenario, observation)
         self._compile()
         self._state = self._initial_state
         self._last_action: int | None = None
 
     def _compile(self) -> None:
         """Make what follows from the scenario and the observation, and is not pickled."""
-        _, _, observe = choose_spaces(self.scenario, self.observation)
+        observe = OBSERVATIONS[self.observation].observation_fn
         params, layout = self.scenario.params, self.scenario.layout
         state = initial_state(params, layout)
         self._initial_state = jax.device_get(state)
@@ -153,7 +155,7 @@ class UavMecGymEnv(gymnasium.Env):
 
 
 def _play_slot(
-    scenario: Scenario, observe: Observe, state: State, action: Int[Array, ""], uniform: Float[Array, " n"]
+    scenario: Scenario, observe: Callable[..., Array], state: State, action: Int[Array, ""], uniform: Float[Array, " n"]
 ) -> tuple[State, Float[Array, " packed"]]:
     """Play one slot; all results but the state are packed into one array, so that they cross from the device at once.
 

@@ -31,7 +31,6 @@ class UavMecSB3VecEnv(VecEnv):
             ValueError: the batch of scenarios has another size, or an option or a value is out of range.
         """
         self.vector_env = UavMecVectorEnv(num_envs, **options)
-        self.render_mode = None
         super().__init__(num_envs, self.vector_env.single_observation_space, self.vector_env.single_action_space)
         self._actions = np.zeros(num_envs, int)
         self._returns = np.zeros(num_envs)

@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from uavmec_jax.agents.observation_spec import OBSERVATIONS
 from uavmec_jax.env.checks import check_range
 from uavmec_jax.env.dynamics import Cause, State
 from uavmec_jax.env.environment import UavMecEnv
@@ -63,13 +64,12 @@ class UavMecVectorEnv(VectorEnv):
         """
         check_range("num_envs", num_envs, ge=1, whole=True)
         self.num_envs = num_envs
-        chosen = choose_scenario(scenario, powered, connected, layout_seed, reward, batch=num_envs)
-        self._scenarios = _batch(num_envs, chosen)
+        self._scenarios = choose_scenario(scenario, powered, connected, layout_seed, reward, batch=num_envs)
         check_scenario(self._scenarios.params, self._scenarios.layout)
-        self.single_observation_space, self.single_action_space, observe = choose_spaces(self._scenarios, observation)
+        self.single_observation_space, self.single_action_space = choose_spaces(self._scenarios, observation)
         self.observation_space: gymnasium.Space = batch_space(self.single_observation_space, num_envs)
         self.action_space: gymnasium.Space = batch_space(self.single_action_space, num_envs)
-        self._env = UavMecEnv(observation_fn=observe)
+        self._env = UavMecEnv(observation_fn=OBSERVATIONS[observation].observation_fn)
         self._state: State | None = None
         self._key, self._steps = jax.random.key(0), 0
 
@@ -118,15 +118,6 @@ class UavMecVectorEnv(VectorEnv):
             final_info = dict(info) | masks
             info |= {"final_obs": final_obs, "_final_obs": ended, "final_info": final_info, "_final_info": ended}
         return observation, reward, terminated, truncated, info
-
-
-def _batch(num_envs: int, scenario: Scenario) -> Scenario:
-    """Return ``num_envs`` scenarios, leaves ``[num_envs, ...]``."""
-    if scenario.layout.capacity.ndim == 1:
-        return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num_envs, *jnp.shape(leaf))), scenario)
-    if scenario.layout.capacity.shape[0] != num_envs:
-        raise ValueError(f"scenario holds {scenario.layout.capacity.shape[0]} layouts; it should hold {num_envs}")
-    return scenario
 
 
 @partial(jax.jit, static_argnums=0)

@@ -6,7 +6,6 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Num, PRNGKeyArray
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
@@ -16,7 +15,7 @@ from uavmec_jax.env.layout import Layout, fleet_of
 from uavmec_jax.env.params import Params
 from uavmec_jax.env.rollout import Policy, Trace, trace
 from uavmec_jax.files.writing import atomic
-from uavmec_jax.reporting.canvas import literal, new_figure
+from uavmec_jax.reporting.canvas import literal, new_figure, pixels
 from uavmec_jax.reporting.map_figure import uav_colour
 from uavmec_jax.reporting.road_map import COLOURS, density_legend, draw_roads, draw_sites, set_limits
 from uavmec_jax.traffic.evacuation import Evacuation
@@ -57,10 +56,7 @@ def save_animation(
     for slot in range(slots):
         figure.clear()
         _draw_slot(figure, evacuation, params, layout, episode, slot, title)
-        canvas = FigureCanvasAgg(figure)
-        canvas.draw()
-        pixels = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
-        frames.append(pixels.quantize(palette=palette, dither=Image.Dither.NONE))
+        frames.append(Image.fromarray(pixels(figure)).quantize(palette=palette, dither=Image.Dither.NONE))
     durations = [_FRAME_MS] * (slots - 1) + [_LAST_FRAME_MS]
     with atomic(path) as partial:
         frames[0].save(

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.measure import Measurement
 from rich.table import Column, Table
 
@@ -38,19 +38,19 @@ def _is_name(column: Column) -> bool:
     return column.justify != "right"
 
 
-def _cells(console: Console, column: Column) -> list[Measurement]:
-    return [Measurement.get(console, console.options.update_width(10_000), cell) for cell in column.cells]
+def _measured(console: Console, *contents: RenderableType) -> list[Measurement]:
+    """Measure contents as if there were room for them."""
+    return [Measurement.get(console, console.options.update_width(10_000), content) for content in contents]
 
 
 def _widest(console: Console, column: Column) -> int:
-    heading = Measurement.get(console, console.options.update_width(10_000), column.header)
-    return max(measured.maximum for measured in [heading, *_cells(console, column)])
+    return max(measured.maximum for measured in _measured(console, column.header, *column.cells))
 
 
 def _least(console: Console, column: Column) -> int:
     """Return the least width of a column: of a number's, that of its cells and of the longest word of its heading."""
     words = max((len(word) for word in str(column.header).split()), default=0)
-    measured = _cells(console, column)
+    measured = _measured(console, *column.cells)
     if _is_name(column):
         return max([words, *(min(cell.minimum, _NAME) for cell in measured)])
     return max([words, *(cell.maximum for cell in measured)])
@@ -60,7 +60,7 @@ def _narrow(console: Console, column: Column) -> Column:
     """Return a column with a heading that has a word in each line, if it is wider than what is below."""
     if _is_name(column):
         return replace(column, no_wrap=False, overflow="fold")
-    cells = max((cell.maximum for cell in _cells(console, column)), default=0)
+    cells = max((cell.maximum for cell in _measured(console, *column.cells)), default=0)
     heading = str(column.header)
     wide = max((len(line) for line in heading.splitlines()), default=0) > cells
     return replace(column, header="\n".join(heading.split()) if wide else column.header, no_wrap=True)

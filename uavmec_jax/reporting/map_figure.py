@@ -6,7 +6,6 @@ import matplotlib
 import numpy as np
 from jaxtyping import UInt8
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
@@ -14,18 +13,15 @@ from uavmec_jax.env.dynamics import State
 from uavmec_jax.env.fleet import DepotKind
 from uavmec_jax.env.layout import Layout
 from uavmec_jax.env.scenario import Scenario
-from uavmec_jax.reporting.canvas import legend_beside
+from uavmec_jax.reporting.canvas import legend_beside, pixels
 
 _RESOURCES = {
-    (True, True): ("#595959", "o", "has both"),
-    (True, False): ("#0072B2", "p", "no comms"),
-    (False, True): ("#C44E00", "D", "no power"),
-    (False, False): ("#6A1B7A", "^", "has neither"),
+    (True, True): ("#595959", "o", 110, "has both"),
+    (True, False): ("#0072B2", "p", 150, "no comms"),
+    (False, True): ("#C44E00", "D", 95, "no power"),
+    (False, False): ("#6A1B7A", "^", 210, "has neither"),
 }
-"""Power and communication of a device -> its colour, its shape, and the label of both."""
-
-_AREA = {"o": 110, "p": 150, "D": 95, "^": 210}
-"""Areas with which the shapes have room for a number, points squared."""
+"""Power and communication of a device -> its colour, its shape, the area in which a number has room, and the label."""
 
 _MOST_ENERGIES = 5
 """UAVs whose energies are in the title."""
@@ -33,11 +29,11 @@ _MOST_ENERGIES = 5
 
 def draw_devices(axis: Axes, layout: Layout) -> None:
     """Draw numbered shapes, one with a colour of its own for each combination of power and communication that there is."""
-    for (power, comms), (colour, shape, label) in _RESOURCES.items():
+    for (power, comms), (colour, shape, area, label) in _RESOURCES.items():
         chosen = (np.asarray(layout.has_power) == power) & (np.asarray(layout.has_comms) == comms)
         x, y = np.asarray(layout.position)[chosen].T
         if chosen.any():
-            axis.scatter(x, y, s=_AREA[shape], marker=shape, color=colour, label=label, zorder=2)
+            axis.scatter(x, y, s=area, marker=shape, color=colour, label=label, zorder=2)
     for device, (x, y) in enumerate(np.asarray(layout.position)):
         axis.annotate(f"{device + 1}", (x, y), ha="center", va="center", fontsize=7, color="white", zorder=3)
     axis.set_aspect("equal", adjustable="datalim")
@@ -75,7 +71,6 @@ def map_pixels(
         Pixels ``[480, 640, 3]``, RGB.
     """
     figure = Figure(figsize=(6.4, 4.8), dpi=100, layout="constrained")
-    canvas = FigureCanvasAgg(figure)
     axis, layout = figure.subplots(), scenario.layout
     draw_devices(axis, layout)
     fraction = np.asarray(state.battery) / np.asarray(layout.capacity)
@@ -91,8 +86,7 @@ def map_pixels(
     uavs = "UAV" if layout.n_uavs == 1 else "UAVs"
     axis.set_title(f"slot {int(state.slot)}, {uavs} {energies}{more} kJ", fontsize=10)
     legend_beside(axis, markerscale=0.7)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    return pixels(figure)
 
 
 def _draw_uavs(axis: Axes, state: State, *, ringed: bool) -> None:
